@@ -4,24 +4,19 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pandas as pd
 
 from toolkit.capture import Capture, Session, Trajectory
-from toolkit.files import pair_name, write_atomic
+from toolkit.files import pair_name
 from toolkit.localizers.correspondences import MAPS, Correspondences, LocalizedQuery, query_group
+from toolkit.store.hdf5 import write_groups
 
 
 def write_queries(path: Path, queries: Mapping[tuple[int, str], LocalizedQuery], maps: Sequence[str] = ()) -> None:
     """Write the correspondences of a pair."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with write_atomic(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs[MAPS] = json.dumps(list(maps))
-        for key, query in queries.items():
-            group = file.create_group(query_group(*key))
-            for name, array in query.arrays().items():
-                group[name] = array
+    groups = ((query_group(*key), query.arrays()) for key, query in queries.items())
+    write_groups(path, groups, {MAPS: json.dumps(list(maps))})
 
 
 def instants(session: Session) -> pd.DataFrame:

@@ -17,6 +17,7 @@ from toolkit.files import SceneFiles
 from toolkit.localize import localize_pairs
 from toolkit.rerank import rerank_pairs
 from toolkit.retrieve import retrieve_pairs
+from toolkit.store.items import Items
 
 PAIR = {"map_device": "ios", "query_device": "ios"}
 QUERIES = "keyframes_original"
@@ -64,7 +65,12 @@ def content(folder: Path) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
-        if path.suffix == ".h5":
+        if path.suffix == ".shard":
+            found[Path(name).parent.as_posix()] = {
+                item: {key: array.tolist() for key, array in arrays.items()}
+                for item, arrays in sorted(Items(path.parent).items())
+            }
+        elif path.suffix == ".h5":
             items: dict[str, Any] = {}
             with h5py.File(path) as file:
                 file.visititems(lambda key, item, items=items: items.update(
@@ -114,6 +120,9 @@ def damage(path: Path, how: str) -> None:
     if path.suffix == ".h5" and how == "one byte differs":  # of numbers, as other bytes may mean nothing
         start = first_number(path)
         damaged = data[:start] + flipped(data[start : start + 1]) + data[start + 1 :]
+    if path.suffix == ".shard" and how == "one byte differs":  # of the first item, which every stage reads
+        start = len(data) // 20
+        damaged = data[:start] + flipped(data[start : start + 1]) + data[start + 1 :]
     if damaged is None:
         path.unlink()
         return
@@ -126,7 +135,7 @@ ARTIFACTS: dict[str, tuple[Callable[[Path, SceneFiles], pd.DataFrame], str, tupl
     "manifest of vectors": (embed, "embeddings/ios_map/*/manifest.csv", ()),
     "record of vectors": (embed, "embeddings/ios_map/*/*.npy.meta.json", ()),
     "vocabulary": (embed, "embeddings/vlad.npz", ()),
-    "features for embed": (embed, "features/ios_map/sift-*.h5", ("embeddings/ios_map/*/*.npy",)),
+    "features for embed": (embed, "features/ios_map/sift-*/*", ("embeddings/ios_map/*/*.npy",)),
     "references": (retrieve, "retrieval/*.jsonl", ()),
     "record of references": (retrieve, "retrieval/*.jsonl.meta.json", ()),
     "reranked references": (rerank, "reranked/*.jsonl", ()),
@@ -135,18 +144,17 @@ ARTIFACTS: dict[str, tuple[Callable[[Path, SceneFiles], pd.DataFrame], str, tupl
     "correspondences": (localize, "poses/*.h5", ()),
     "what is known of a map": (localize, "poses/*_map_ios.json", ()),
     "record of poses": (localize, "poses/*.txt.meta.json", ()),
-    "record of correspondences": (localize, "poses/*.h5.meta.json", ("poses/*.txt",)),
+    "results of queries": (localize, "poses/*.items/*", ("poses/*.txt",)),
     "map": (localize, "map/ios_map.npz", ()),
-    "matches of the map": (localize, "map/*/*.h5", ("map/ios_map.npz",)),
-    "features of the map": (localize, "features/ios_map/sift-*.h5", ("map/ios_map.npz", "map/*/*.h5")),
-    "record of features": (localize, "features/ios_map/sift-*.h5.meta.json", ("map/ios_map.npz", "map/*/*.h5")),
-    "features of queries": (localize, "features/ios_query/sift-*.h5", ("poses/*.h5", "poses/*.txt")),
+    "matches of the map": (localize, "map/*/*/*.shard", ("map/ios_map.npz",)),
+    "features of the map": (localize, "features/ios_map/sift-*/*", ("map/ios_map.npz", "map/ios_map-*/*/*.shard")),
+    "features of queries": (localize, "features/ios_query/sift-*/*", ("poses/*.items/*", "poses/*.txt")),
 }
 """The stage that makes an artifact, its files, and what has to be gone so that the stage looks at it again."""
 
 
 QUICK = ("vectors", "poses")  # with all kinds of damage
-LONG = ("features of the map", "record of features")  # the whole map is made again
+LONG = ("features of the map",)  # the whole map is made again
 
 
 def is_quick(artifact: str, how: str) -> bool:

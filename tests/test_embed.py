@@ -15,14 +15,14 @@ from PIL import Image
 
 from tests.calls import call
 from tests.models.test_megaloc import tiny_megaloc
+from toolkit import embed
 from toolkit.capture import Session, Trajectory, write_session
 from toolkit.capture.images import read_image
 from toolkit.capture.turning import turned_from_cam
-from toolkit.embed import VECTORS, embed_sessions, write_matrix
+from toolkit.embed import embed_sessions, write_matrix
 from toolkit.embedders import load_embeddings
 from toolkit.embedders.megaloc import MegaLocEmbedder
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError, WeightsError
-from toolkit.features.groups import GroupWriter
 from toolkit.geometry import invert, qt_from_pose
 from toolkit.models.megaloc import MegaLoc
 from toolkit.retrieve import retrieve_pairs
@@ -300,11 +300,8 @@ def test_a_killed_run_goes_on_within_a_subsession(
 def test_a_matrix_is_what_numpy_writes(tmp_path: Path, dtype: str, batches: list[int]) -> None:
     vectors = np.random.default_rng(0).random((sum(batches), 3), np.float32)
     np.save(tmp_path / "numpy.npy", vectors.astype(dtype))
-    with GroupWriter(tmp_path / "ours.npy", {}) as writer:
-        for number, batch in enumerate(np.split(vectors, np.cumsum(batches)[:-1]) if batches else []):
-            writer.add(str(number), arrays={VECTORS: batch})
-        write_matrix(tmp_path / "ours.npy", writer, len(vectors), 3, dtype)
-        writer.discard()
+    parts = np.split(vectors, np.cumsum(batches)[:-1]) if batches else []
+    write_matrix(tmp_path / "ours.npy", parts, len(vectors), 3, dtype)
     assert (tmp_path / "ours.npy").read_bytes() == (tmp_path / "numpy.npy").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["numpy.npy", "ours.npy"]
 
@@ -418,7 +415,7 @@ def test_a_run_killed_after_the_matrix_was_written_leaves_no_progress_beside_it(
 ) -> None:
     go = {"device": "hl", **megaloc}
     with monkeypatch.context() as patch:
-        patch.setattr(GroupWriter, "discard", Mock(side_effect=KeyboardInterrupt))
+        patch.setattr(embed, "remove_items", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             call(embed_sessions, tiny / "sessions", tmp_path / "e", **go)  # type: ignore[arg-type]
     assert list((tmp_path / "e/hl_map/hl_a").glob(".*"))

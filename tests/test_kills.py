@@ -17,6 +17,7 @@ import pytest
 
 from tests.conftest import REPOSITORY
 from tests.show.test_recordings import read_back
+from toolkit.store.items import Items
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="needs fork and SIGKILL")]
 
@@ -74,7 +75,7 @@ def recorded(path: Path) -> dict[str, list[str]]:
 
 
 def arrays_of(path: Path) -> dict[str, object]:
-    """Return arrays and attributes of an HDF5 file; the order of its bytes changes with the parts it is joined from."""
+    """Return arrays and attributes of an HDF5 file."""
     with h5py.File(path) as file:
         found: dict[str, object] = {"": repr(sorted(file.attrs.items()))}
 
@@ -96,7 +97,11 @@ def products(run: Path) -> dict[str, object]:
             continue
         if name in ("run.json", "run.log") or "/.stages/" in name:
             continue
-        if path.suffix == ".rrd":
+        if path.suffix == ".shard":  # kills change which item is in which
+            items = {item: {key: array.tolist() for key, array in arrays.items()}
+                     for item, arrays in Items(path.parent).items()}  # fmt: skip
+            found[path.parent.relative_to(run).as_posix()] = items
+        elif path.suffix == ".rrd":
             found[name] = recorded(path)
         elif path.suffix == ".h5":
             found[name] = arrays_of(path)

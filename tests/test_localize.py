@@ -33,7 +33,6 @@ from toolkit.embed import embed_sessions
 from toolkit.embedders import EMBEDDERS
 from toolkit.errors import ArtifactError, CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.evaluate import evaluate_scene
-from toolkit.features import groups
 from toolkit.features.features import KINDS, LocalFeatures
 from toolkit.features.matching import MATCHERS, LocalMethod, MutualMatcher, unit_descriptors
 from toolkit.features.sift import SiftExtractor, SiftSettings
@@ -201,7 +200,7 @@ def test_rows_say_how_a_pose_came_about(finished: tuple[SceneFiles, pd.DataFrame
 def test_a_finished_run_leaves_no_partial_files(finished: tuple[SceneFiles, pd.DataFrame]) -> None:
     names = {path.name for path in finished[0].poses_dir.iterdir()}
     stems = [finished[0].poses_txt("ios", device).stem for device in DEVICES]
-    ends = ".txt", ".csv", ".h5", ".txt.meta.json", ".h5.meta.json"
+    ends = ".txt", ".csv", ".h5", ".txt.meta.json", ".items"
     of_the_map = {f"{finished[0].scene}_map_ios.json", f"{finished[0].scene}_map_ios.json.meta.json", "settings.json"}
     assert names == {stem + end for stem in stems for end in ends} | of_the_map
 
@@ -546,7 +545,7 @@ def test_a_network_is_asked_once_about_a_query_that_escalates(
     assert sum(asked) == table["queries"].item() == table["escalated"].item()
 
 
-def test_a_torn_part_costs_at_most_what_it_held(
+def test_a_torn_shard_costs_at_most_what_it_held(
     small_capture: Path,
     run: SceneFiles,
     finished: tuple[SceneFiles, pd.DataFrame],
@@ -556,29 +555,21 @@ def test_a_torn_part_costs_at_most_what_it_held(
         spy(patch, fail_at=2, error=KeyboardInterrupt())
         with pytest.raises(KeyboardInterrupt):
             run_stage(small_capture, run, query_device="ios")
-    (part,) = run.poses_dir.glob(".*.parts/*.h5")
-    part.write_bytes(part.read_bytes()[:-100])
+    (shard,) = run.poses_dir.glob("*.items/*.shard")
+    shard.write_bytes(shard.read_bytes()[:-100])
     calls = spy(monkeypatch)
     run_stage(small_capture, run, query_device="ios")
     assert len(calls) == 3
     assert run.poses_txt("ios", "ios").read_bytes() == finished[0].poses_txt("ios", "ios").read_bytes()
 
 
-@pytest.mark.parametrize("torn", ["the table", "the record of the correspondences"])
+@pytest.mark.parametrize("torn", ["_write_poses", "write_sidecar", "write_groups"])
 def test_a_run_killed_at_its_end_leaves_no_files_of_two_runs(small_capture: Path, run: SceneFiles, torn: str) -> None:
     run_stage(small_capture, run, query_device="ios")
     before = run.poses_txt("ios", "ios").read_bytes()
     path = run.poses_txt("ios", "ios").with_suffix(".h5")
-
-    write_sidecar = groups.write_sidecar
-
-    def killed(written: Path, *content: Any, **more: Any) -> None:
-        if torn == "the table" or written == path:
-            raise KeyboardInterrupt
-        write_sidecar(written, *content, **more)
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(*((localize, "_write_poses") if torn == "the table" else (groups, "write_sidecar")), killed)
+        patch.setattr(localize, torn, Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             run_stage(small_capture, run, query_device="ios", method="nearest")
     assert not run.poses_txt("ios", "ios").exists()

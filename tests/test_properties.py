@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -32,11 +33,12 @@ from toolkit.capture.tables import COLUMNS, KeyIndex, read_query_table, read_tab
 from toolkit.embedders.search import search
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
 from toolkit.exchange.submission import Submission
-from toolkit.features.groups import GroupWriter
 from toolkit.files import read_references
 from toolkit.localizers.alignment import Sim3, align_to_map
 from toolkit.localizers.correspondences import Correspondences, LocalizedQueries, LocalizedQuery, query_group
 from toolkit.manifest import STAGES, Manifest, load_manifest
+from toolkit.store.hdf5 import write_groups
+from toolkit.store.items import Items
 
 settings.register_profile("quick", derandomize=True, database=None, deadline=None, max_examples=25)
 settings.register_profile("thorough", derandomize=True, database=None, deadline=None, max_examples=200)
@@ -320,21 +322,22 @@ def test_a_submission_holds_the_poses(qt: np.ndarray, data: st.DataObject, tmp_p
 @same_folder
 def test_correspondences_come_back(data: st.DataObject, keys: list[tuple[int, str]], tmp_path: Path) -> None:
     queries = {}
-    with GroupWriter(tmp_path / "pair.h5", {}) as writer:
-        writer.discard()
+    for key in keys:
+        count, views = data.draw(st.integers(0, 3)), data.draw(st.integers(0, 3))
+        names = st.lists(ids, max_size=2)
+        queries[key] = LocalizedQuery(
+            data.draw(names), data.draw(names), data.draw(names),
+            Correspondences(
+                np.arange(count), np.full((count, 2), 1.5), np.full((count, 3), 1 / 3), np.arange(count) - 1,
+                np.arange(count) % 2 == 0, np.array(["sift/guided", "sift/lifted", "x"][:count], "U11"),
+                np.arange(views), np.arange(views), np.full((views, 2), 2.5),
+            ),
+        )  # fmt: skip
+    shutil.rmtree(tmp_path / "items", ignore_errors=True)
+    with Items(tmp_path / "items") as items:  # as the localize stage does: one by one, and then as one file
         for key in keys:
-            count, views = data.draw(st.integers(0, 3)), data.draw(st.integers(0, 3))
-            names = st.lists(ids, max_size=2)
-            queries[key] = LocalizedQuery(
-                data.draw(names), data.draw(names), data.draw(names),
-                Correspondences(
-                    np.arange(count), np.full((count, 2), 1.5), np.full((count, 3), 1 / 3), np.arange(count) - 1,
-                    np.arange(count) % 2 == 0, np.array(["sift/guided", "sift/lifted", "x"][:count], "U11"),
-                    np.arange(views), np.arange(views), np.full((views, 2), 2.5),
-                ),
-            )  # fmt: skip
-            writer.add(query_group(*key), arrays=queries[key].arrays())
-        writer.finish()
+            items.add(query_group(*key), "", queries[key].arrays())
+    write_groups(tmp_path / "pair.h5", items.items(), {})
     stored = LocalizedQueries(tmp_path / "pair.h5")
     assert {*stored} == {*queries}
     for key, query in queries.items():

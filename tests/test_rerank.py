@@ -21,7 +21,6 @@ from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.evaluate import overlap_in_view, overlap_table
 from toolkit.features import verification
 from toolkit.features.features import KINDS, LocalFeatures
-from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import LocalMethod, MutualMatcher
 from toolkit.features.sift import SiftExtractor
 from toolkit.features.verification import is_meaningful, verified_matches
@@ -248,7 +247,7 @@ def test_a_run_killed_after_the_file_was_written_leaves_no_progress_beside_it(
 ) -> None:
     sidecar_path(reranked(files)).unlink()
     with monkeypatch.context() as patch:
-        patch.setattr(GroupWriter, "discard", Mock(side_effect=KeyboardInterrupt))
+        patch.setattr(rerank, "remove_items", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             run(small_capture, files)
     assert list(files.reranked_dir.glob(".*"))

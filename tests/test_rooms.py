@@ -17,6 +17,7 @@ LEVELS: list[tuple[str, ...]] = [
     ("models",),
     ("manifest",),
     ("runs",),
+    ("store",),
     ("features",),
     ("embedders",),
     ("localizers",),

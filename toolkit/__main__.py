@@ -61,7 +61,7 @@ Names = Annotated[
     typer.Option(
         "--names",
         metavar="own|capture",
-        help="Name imported images as in your folder (own), or as in the capture and the run's HDF5 files (capture).",
+        help="Name imported images as in your folder (own), or as in the capture (capture).",
     ),
 ]
 Capture = Annotated[Path | None, typer.Option(help="Capture folder, if it has moved since the run.")]
@@ -411,6 +411,35 @@ def export_intrinsics(
     from toolkit.exchange import export
 
     print(f"{out}: {export.export_intrinsics(run, scene, map_device, query_device, out, capture, names)} images")
+
+
+@export_app.command("features")
+def export_features(
+    run: Run,
+    scene: Scene,
+    session: Annotated[str, typer.Argument(help="Session, e.g. ios_map.")],
+    out: Annotated[Path, typer.Argument(help="HDF5 file.")],
+    kind: Annotated[str, typer.Option(help="Kind of features.")] = "sift",
+) -> None:
+    """Write the local features of a session in hloc's format."""
+    from toolkit.exchange import hloc
+
+    print(f"{out}: {hloc.export_features(run, scene, session, out, kind)} images")
+
+
+@export_app.command("matches")
+def export_matches(
+    run: Run,
+    scene: Scene,
+    session0: Annotated[str, typer.Argument(help="Session of the first images, e.g. ios_map.")],
+    session1: Annotated[str, typer.Argument(help="Session of the second images; the same for the pairs of a map.")],
+    out: Annotated[Path, typer.Argument(help="HDF5 file.")],
+    kind: Annotated[str, typer.Option(help="Kind of features.")] = "sift",
+) -> None:
+    """Write the matches of two sessions in hloc's format."""
+    from toolkit.exchange import hloc
+
+    print(f"{out}: {hloc.export_matches(run, scene, session0, session1, out, kind)} pairs")
 
 
 @app.command()

@@ -4,7 +4,7 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
@@ -24,7 +24,6 @@ from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import WEIGHTS, Embedder, create_embedder, resolve_model, shows_upright
 from toolkit.errors import CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures
-from toolkit.features.groups import GroupWriter, heals, sweep
 from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import (
@@ -41,6 +40,7 @@ from toolkit.files import (
 from toolkit.geometry import Ints, unit
 from toolkit.manifest import EmbedSettings
 from toolkit.models.weights import resolve_weights
+from toolkit.store.items import Items, heals, items_beside, remove_items
 from toolkit.threads import one_thread
 
 log = logging.getLogger(__name__)
@@ -170,19 +170,19 @@ def _embed_with_model(
         }
         skipped = skip_existing and (is_current(matrix_path, record) or folders.take_over(matrix_path, record))
         if skipped:
-            sweep(matrix_path)
+            remove_items(matrix_path)
             embedded = len(np.load(matrix_path, mmap_mode="r"))
         else:
             # Progress is kept per batch, so it depends on the batch size; the finished matrix does not, up to rounding.
-            with GroupWriter(matrix_path, {**record, "rows_a_batch": settings.batch_size}) as batches:
-                if not skip_existing:
-                    batches.discard()
-                failed = _embed(embedder, part, batches, settings, store_of)
+            source = fingerprint({**record, "rows_a_batch": settings.batch_size})
+            with Items(items_beside(matrix_path), again=not skip_existing) as batches:
+                failed = _embed(embedder, part, batches, source, settings, store_of)
                 embedded = len(part.rows) - len(failed)
                 tables = _write_tables(folder, capture.name, part, failed)
-                write_matrix(matrix_path, batches, embedded, embedder.dim, settings.dtype)
+                vectors = (batches[name][VECTORS] for name in _names(part, settings))
+                write_matrix(matrix_path, vectors, embedded, embedder.dim, settings.dtype)
                 write_sidecar(matrix_path, record, tables)
-                batches.discard()
+            remove_items(matrix_path)
         table.append(
             {
                 "session": part.session.id,
@@ -322,21 +322,28 @@ def _vocabulary(capture: Capture, folders: _Folders, settings: EmbedSettings, sk
 def _embed(
     embedder: Embedder,
     part: _Subsession,
-    batches: GroupWriter,
+    batches: Items,
+    source: str,
     settings: EmbedSettings,
     store_of: Callable[[str], FeatureStore],
 ) -> dict[int, str]:
     """Add the vectors of the readable images, in order; return the reason for each unreadable one, by row."""
     store = store_of(part.session.id) if embedder.inputs == "features" else None
-    count, label = -(-len(part.rows) // settings.batch_size), f"embed {part.session.id}/{part.name}"
-    todo = batches.left([(f"{number:08d}", "", number) for number in range(count)])
+    names, label = _names(part, settings), f"embed {part.session.id}/{part.name}"
+    todo = batches.left((name, source, number) for number, name in enumerate(names))
     arguments = embedder, part, settings, store, label
     _embed_into(batches, batches.spread(_embed_into, todo, arguments, label, "batch"), *arguments)
-    return {row: reason for note in batches.notes().values() for row, reason in note["failed"]}
+    batches.flush()
+    return {row: reason for name in names for row, reason in batches.note(name)["failed"]}
+
+
+def _names(part: _Subsession, settings: EmbedSettings) -> list[str]:
+    """Return the names of the batches of a subsession, in order."""
+    return [f"{number:08d}" for number in range(-(-len(part.rows) // settings.batch_size))]
 
 
 def _embed_into(
-    batches: GroupWriter,
+    batches: Items,
     todo: Sequence[tuple[str, str, int]],
     embedder: Embedder,
     part: _Subsession,
@@ -344,7 +351,7 @@ def _embed_into(
     store: FeatureStore | None,
     label: str,
 ) -> None:
-    """Embed the batches `todo` (group, "", number); store their vectors and the reasons for unreadable images."""
+    """Embed the batches `todo` (name, source, number); store their vectors and the reasons for unreadable images."""
     size = settings.batch_size
     slices = [slice(number * size, (number + 1) * size) for *_, number in todo]
     left = np.concatenate([np.zeros(0, np.int64), *(np.arange(len(part.rows))[rows] for rows in slices)])
@@ -361,23 +368,23 @@ def _embed_into(
     bar = tqdm(total=len(part.rows), initial=len(part.rows) - len(left), desc=label, unit="image")
     # Features are described in a thread a core; a network has its own threads.
     with bar, one_thread() if store is not None else nullcontext():
-        for (group, *_), (batch, unreadable) in zip(todo, stacked, strict=True):
+        for (name, source, _), (batch, unreadable) in zip(todo, stacked, strict=True):
             vectors = embedder.embed(batch)
             if vectors.shape != (len(batch), embedder.dim):
                 raise ValueError(f"{embedder.name} gave {vectors.shape}; expected {(len(batch), embedder.dim)}.")
             if settings.normalize:
                 vectors = unit(vectors)
-            batches.add(group, arrays={VECTORS: vectors}, note={"failed": list(unreadable.items())})
+            batches.add(name, source, {VECTORS: vectors}, {"failed": list(unreadable.items())})
             bar.update(len(batch) + len(unreadable))
 
 
-def write_matrix(path: Path, batches: GroupWriter, rows: int, dim: int, dtype: str) -> None:
+def write_matrix(path: Path, batches: Iterable[NDArray[np.floating]], rows: int, dim: int, dtype: str) -> None:
     """Write the vectors of all batches to a `.npy` file (rows, dim), one batch in memory at a time."""
     with write_atomic(path) as temporary, open(temporary, "wb") as stream:
         header = {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": (rows, dim)}
         np.lib.format.write_array_header_1_0(stream, header)
-        for _, arrays in batches.read():
-            stream.write(np.ascontiguousarray(arrays[VECTORS], dtype).tobytes())
+        for vectors in batches:
+            stream.write(np.ascontiguousarray(vectors, dtype).tobytes())
 
 
 def _inputs(

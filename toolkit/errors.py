@@ -36,7 +36,7 @@ class ArtifactError(ToolkitError):
 
 
 class DamagedError(ArtifactError):
-    """Groups of a file differ from what was written; see `features.groups.heals`."""
+    """Items of a file differ from what was written; see `store.items.heals`."""
 
     def __init__(self, path: Path, message: str) -> None:
         super().__init__(message)

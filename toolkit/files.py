@@ -187,7 +187,6 @@ def write_sidecar(
     others: Iterable[str | Path] = (),
     *,
     made_from: Iterable[str | Path] = (),
-    checksums: bool = True,
     unfinished: bool = False,
 ) -> None:
     """Record the settings and inputs of the artifact `path`, and the checksums of its files.
@@ -197,14 +196,13 @@ def write_sidecar(
     Args:
         others: further files beside it that belong to the artifact.
         made_from: existing files that it was made from, see `changed_sources`.
-        checksums: False for a file that contains checksums of its own; only its size is recorded.
         unfinished: a part of the artifact failed and must be tried again: this run uses it, later runs do not reuse it.
     """
     files = [Path(path), *map(Path, others)]
     record = {
         "version": __version__,
         "fingerprint": fingerprint(settings),
-        "files": {file.name: [file.stat().st_size, checksum(file) if checksums else None] for file in files},
+        "files": {file.name: [file.stat().st_size, checksum(file)] for file in files},
         "made_from": (sources := {os.path.relpath(one, Path(path).parent): _content(one) for one in made_from}),
         "sources": fingerprint(sources),
         **({"unfinished": True} if unfinished else {}),

@@ -20,7 +20,6 @@ from toolkit.capture.images import default_workers, prefetch
 from toolkit.capture.tables import in_unit_of_poses, read_query_table
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import INTERNAL, ToolkitError, reason_of
-from toolkit.features.groups import GroupWriter, heals
 from toolkit.features.matching import AnyMethod, MutualMatcher, resolve_auto, weights_files
 from toolkit.features.stores import FeatureStore, MatchStore, extract_session, match_sessions
 from toolkit.files import (
@@ -68,6 +67,8 @@ from toolkit.localizers.queries import localized_query, references_of_images, st
 from toolkit.manifest import LocalizeSettings
 from toolkit.runs.pairs import PairRows
 from toolkit.show.metrics import camera_messages
+from toolkit.store.hdf5 import write_groups
+from toolkit.store.items import Items, heals
 from toolkit.threads import fixed_sums
 
 __all__ = ["COLUMNS", "PREDICTION_COLUMNS", "Map", "explain_query", "localize_image", "localize_pairs"]
@@ -207,7 +208,7 @@ class _Pair:
         return self.stage.folders.out / f"{self.retrieval.stem}.{suffix}"
 
     def remove_poses(self) -> None:
-        """Remove the poses of an earlier run. The `.h5` file stays: from it they can be written again quickly."""
+        """Remove the poses of an earlier run. The items stay: from them they can be written again quickly."""
         for poses in (self.file("txt"), sidecar_path(self.file("txt")), self.file("csv")):
             poses.unlink(missing_ok=True)
 
@@ -343,8 +344,15 @@ class _Stage(Remade):
 
 _Task = tuple[int, Query, list[References], Any, float]
 """Number of a query, the query, its references, the prediction of a network, and the seconds which that took."""
-_Localized = tuple[str, int, dict[str, Any]]
-"""Group of a query in the `.h5` file, its number, and its table row."""
+_Todo = tuple[str, str, int]
+"""Name of a query's item, fingerprint of its sources, and number of the query."""
+_ToEscalate = tuple[str, str, int, dict[str, Any]]
+"""Name of the item of an escalated query, fingerprint of its sources, number of the query, and its first table row."""
+_Faulty = dict[int, tuple[dict[str, Any], LocalizedQuery]]
+"""Number of a query that failed with an internal error -> its row and correspondences. It gets no item, so the next run
+tries it again."""
+_ESCALATED = "/escalated"
+"""Ends the name of a query's item with the escalation features. It has no arrays if the first correspondences count."""
 
 
 class _PairRun:
@@ -403,31 +411,38 @@ class _PairRun:
         return stored_query(self.pair.session, rows, self.references, self.stores, self.matches, turns)
 
     def localize(self, record: dict[str, Any], h5_attributes: Mapping[str, str]) -> list[dict[str, Any]]:
-        """Localize the queries that are not in the file yet; return a row per query, in the keyframe list's order."""
-        path = self.pair.file("h5")
-        groups = [query_group(*key) for key in self.keys]
-        with GroupWriter(path, record, h5_attributes) as writer:
-            if not self.stage.skip_existing:
-                writer.discard()
-            writer.drop_damaged()
-            numbers = {group: number for number, group in enumerate(groups)}  # a keyframe list may repeat a query
-            # Queries that fail with an internal error get no row in the file, so the next run repeats them.
-            todo = writer.spread(
-                _localize_share, _not_localized(writer, list(numbers.items())), (self.stage.of_worker, *self.devices),
-                self._label, "query", self.first.batch_size, _not_localized,
+        """Localize the queries that are not localized yet, and write the `.h5` file.
+
+        Returns:
+            A row per query, in the keyframe list's order.
+        """
+        names, source = [query_group(*key) for key in self.keys], fingerprint(record)
+        numbers = {name: number for number, name in enumerate(names)}  # a keyframe list may repeat a query
+        with Items(self.pair.file("items"), again=not self.stage.skip_existing) as items:
+            items.drop_damaged()
+            todo = items.spread(
+                _localize_share, items.left((name, source, number) for name, number in numbers.items()),
+                (self.stage.of_worker, *self.devices), self._label, "query", self.first.batch_size,
             )  # fmt: skip
-            faulty = self.localize_into(writer, todo)
+            faulty = self.localize_into(items, todo)
             if isinstance(self.localizer, EscalatingLocalizer):
-                rows = writer.notes()
-                localized = [(group, number, rows[group]) for group, number in numbers.items() if group in rows]
-                faulty |= self._escalate(writer, localized)
-            # If the run is killed before it writes the new poses, no poses of an earlier run may lie beside this file.
-            for poses in (self.pair.file("txt"), sidecar_path(self.pair.file("txt"))):
-                poses.unlink(missing_ok=True)
-            writer.finish()
-            rows = writer.notes() | faulty
+                items.flush()
+                localized = [(name, source, number) for name, number in numbers.items() if number not in faulty]
+                faulty |= self._escalate(items, localized)
+        last = {name: name + _ESCALATED * items.is_current(name + _ESCALATED, source) for name in numbers}
+        # If the run is killed before it writes the new poses, no poses of an earlier run may lie beside this file.
+        for poses in (self.pair.file("txt"), sidecar_path(self.pair.file("txt"))):
+            poses.unlink(missing_ok=True)
+        groups = (
+            (name, faulty[number][1].arrays() if number in faulty else items[last[name]] or items[name])
+            for name, number in numbers.items()
+        )
+        write_groups(self.pair.file("h5"), groups, h5_attributes)
         images = self.pair.session.own_names(self.rows)
-        return [rows[group] | {"image": image} for group, image in zip(groups, images, strict=True)]
+        rows = {
+            name: faulty[number][0] if number in faulty else items.note(last[name]) for name, number in numbers.items()
+        }
+        return [rows[name] | {"image": image} for name, image in zip(names, images, strict=True)]
 
     @property
     def devices(self) -> tuple[str, str]:
@@ -438,38 +453,27 @@ class _PairRun:
     def _label(self) -> str:
         return f"localize {self.pair.query_device} in {self.pair.map_device}"
 
-    def localize_into(self, writer: GroupWriter, todo: Sequence[tuple[str, int]]) -> dict[str, dict[str, Any]]:
-        """Localize queries, given by group and number, and add them to a file.
-
-        Returns:
-            The rows, by group, of queries that failed with an internal error; the file does not record them as done.
-        """
-        faulty: dict[str, dict[str, Any]] = {}
-        tasks = self._predicted(self.first, [number for _, number in todo])
+    def localize_into(self, items: Items, todo: Sequence[_Todo]) -> _Faulty:
+        """Localize queries and add them as items; return those that failed with an internal error."""
+        faulty: _Faulty = {}
+        of_number = {number: (name, source) for name, source, number in todo}
+        tasks = self._predicted(self.first, list(of_number))
         for number, row, localized in self._localized(self.first.localize, tasks, len(todo)):
-            self._add(writer, query_group(*self.keys[number]), row, localized, faulty)
+            if _is_internal(row):
+                faulty[number] = row, localized
+            else:
+                items.add(*of_number[number], localized.arrays(), row)
         return faulty
 
-    def _add(
-        self,
-        writer: GroupWriter,
-        group: str,
-        row: dict[str, Any],
-        localized: LocalizedQuery,
-        faulty: dict[str, dict[str, Any]],
-    ) -> None:
-        """Record a query as done, unless it failed with an internal error."""
-        if _is_internal(row):
-            faulty[group] = row
-        writer.add(group, arrays=localized.arrays(), note=None if group in faulty else row)
-
-    def _escalate(self, writer: GroupWriter, localized: Sequence[_Localized]) -> dict[str, dict[str, Any]]:
+    def _escalate(self, items: Items, localized: Sequence[_Todo]) -> _Faulty:
         """Localize queries without a sure pose again, with the escalation features; returns as `localize_into`."""
         limit = self.map.sure_position_std
+        rows = {number: items.note(name) for name, _, number in localized}
+        escalated = [(name + _ESCALATED, source, number) for name, source, number in localized]
         todo = [
-            (group, number, row)
-            for group, number, row in localized
-            if not (row.get("first_status") or row["misfit"] or is_sure(row["status"], row["position_std_m"], limit))
+            (name, source, number, row)
+            for name, source, number in items.left(escalated)
+            if not ((row := rows[number])["misfit"] or is_sure(row["status"], row["position_std_m"], limit))
             and can_gain(*self.query(number))
         ]
         if not todo:
@@ -477,43 +481,41 @@ class _PairRun:
         started = time.perf_counter()
         self.add_escalation(todo)
         shared = (time.perf_counter() - started) / len(todo)
-        arguments = self.stage.of_worker, *self.devices, shared
-        todo = writer.spread(_escalate_share, todo, arguments, self._label, "query", left=_not_escalated)
-        return self.escalate_into(writer, todo, shared)
+        todo = items.spread(_escalate_share, todo, (self.stage.of_worker, *self.devices, shared), self._label, "query")
+        return self.escalate_into(items, todo, shared)
 
-    def add_escalation(self, localized: Sequence[_Localized]) -> None:
+    def add_escalation(self, todo: Sequence[_ToEscalate]) -> None:
         """Extract and match the escalation features of queries."""
         for kind in self.map.escalation:
-            self._add_kind(kind, [number for _, number, _ in localized])
+            self._add_kind(kind, [number for _, _, number, _ in todo])
 
-    def escalate_into(
-        self, writer: GroupWriter, first_results: Sequence[_Localized], shared: float
-    ) -> dict[str, dict[str, Any]]:
-        """Localize queries again with the escalation features, which are extracted; add the better results to a file.
+    def escalate_into(self, items: Items, todo: Sequence[_ToEscalate], shared: float) -> _Faulty:
+        """Localize queries again with the escalation features, which are extracted; add them, if better, as items.
 
         Args:
-            first_results: the queries with their rows before escalation.
             shared: seconds per query that the extraction took.
 
         Returns:
             As `localize_into`.
         """
         assert isinstance(self.localizer, EscalatingLocalizer)
-        faulty: dict[str, dict[str, Any]] = {}
-        first_rows = {number: (group, row) for group, number, row in first_results}
+        faulty: _Faulty = {}
+        of_number = {number: (name, source, row) for name, source, number, row in todo}
         # The first poses take the place of a prediction.
-        tasks = ((number, *self.query(number), row["known"], shared) for number, (_, row) in first_rows.items())
-        for number, row, localized in self._localized(self.localizer.escalate, tasks, len(first_results)):
-            group, first_row = first_rows[number]
+        tasks = ((number, *self.query(number), row["known"], shared) for number, (*_, row) in of_number.items())
+        for number, row, localized in self._localized(self.localizer.escalate, tasks, len(todo)):
+            name, source, first_row = of_number[number]
             history = {
                 "first_status": first_row["status"],
                 "first_seconds": first_row["seconds"],
                 "seconds": round(first_row["seconds"] + row["seconds"], 4),
             }
-            if _is_internal(row) or is_better(row["status"], first_row["status"]):
-                self._add(writer, group, row | history, localized, faulty)
+            if _is_internal(row):
+                faulty[number] = row | history, localized
+            elif is_better(row["status"], first_row["status"]):
+                items.add(name, source, localized.arrays(), row | history)
             else:
-                writer.annotate(group, first_row | history)
+                items.add(name, source, note=first_row | history)
         return faulty
 
     def _localized(
@@ -554,29 +556,17 @@ class _PairRun:
 
 
 def _localize_share(
-    writer: GroupWriter, todo: Sequence[tuple[str, int]], stage: _Stage, map_device: str, query_device: str
+    items: Items, todo: Sequence[_Todo], stage: _Stage, map_device: str, query_device: str
 ) -> None:
-    stage.run(map_device, query_device).localize_into(writer, todo)
-
-
-def _not_localized(writer: GroupWriter, todo: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
-    """Return the queries without a row in the file."""
-    rows = writer.notes()
-    return [item for item in todo if item[0] not in rows]
+    stage.run(map_device, query_device).localize_into(items, todo)
 
 
 def _escalate_share(
-    writer: GroupWriter, todo: Sequence[_Localized], stage: _Stage, map_device: str, query_device: str, shared: float
+    items: Items, todo: Sequence[_ToEscalate], stage: _Stage, map_device: str, query_device: str, shared: float
 ) -> None:
     run = stage.run(map_device, query_device)
     run.add_escalation(todo)
-    run.escalate_into(writer, todo, shared)
-
-
-def _not_escalated(writer: GroupWriter, todo: Sequence[_Localized]) -> list[_Localized]:
-    """Return the queries whose row in the file does not record an escalation."""
-    rows = writer.notes()
-    return [item for item in todo if not rows.get(item[0], {}).get("first_status")]
+    run.escalate_into(items, todo, shared)
 
 
 def _is_internal(row: Mapping[str, Any]) -> bool:

@@ -23,12 +23,12 @@ from toolkit.capture.images import default_workers, prefetch
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import INTERNAL, ArtifactError, reason_of
 from toolkit.features.features import KINDS
-from toolkit.features.groups import GroupWriter, heals, sweep
 from toolkit.features.matching import LocalMethod, create_local_methods, resolve_auto
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.features.verification import Verifier
 from toolkit.files import (
     file_fingerprint,
+    fingerprint,
     image_name,
     is_current,
     pair_name,
@@ -39,6 +39,7 @@ from toolkit.files import (
 from toolkit.geometry import Ints
 from toolkit.manifest import RerankSettings
 from toolkit.runs.pairs import PairRows
+from toolkit.store.items import Items, heals, items_beside, remove_items
 from toolkit.threads import one_thread
 
 log = logging.getLogger(__name__)
@@ -101,7 +102,7 @@ def rerank_pairs(
                 pair = _Pair(*sessions, Path(retrieval_dir) / name, Path(out_dir) / name, method, settings, turns)
                 skipped = skip_existing and is_current(pair.path, pair.record)
                 if skipped:
-                    sweep(pair.path)
+                    remove_items(pair.path)
                 else:
                     pair.rerank(Path(features_dir), workers, skip_existing)
                 row |= _counts(read_references(pair.path))
@@ -165,10 +166,9 @@ class _Pair:
             except Exception as error:  # one bad query must not end the run
                 return index, self._kept(queries[index], reason_of(error, f"reranking {queries[index]['path']}"))
 
-        with GroupWriter(self.path, self.record) as progress:
-            if not skip_existing:
-                progress.discard()
-            todo = [index for index in range(len(queries)) if str(index) not in progress.notes()]
+        source = fingerprint(self.record)
+        with Items(items_beside(self.path), again=not skip_existing) as progress:
+            todo = [int(name) for name, _ in progress.left((str(index), source) for index in range(len(queries)))]
             # Queries with the same first reference run one after another, so that it is read once.
             todo.sort(key=lambda index: _name(queries[index]["topk"][0]) if queries[index]["topk"] else "")
             label = f"rerank {self.query_session.device} in {self.map_session.device}"
@@ -179,12 +179,13 @@ class _Pair:
                 if row["reason"].startswith(INTERNAL):
                     broken[str(index)] = row
                 else:
-                    progress.add(str(index), note=row)
-            rows = progress.notes() | broken
+                    progress.add(str(index), source, note=row)
+            progress.flush()
+            rows = {name: progress.note(name) for name in progress} | broken
             write_text(self.path, "".join(json.dumps(rows[str(index)]) + "\n" for index in range(len(queries))))
             write_sidecar(self.path, self.record, made_from=[self.retrieval], unfinished=bool(broken))
-            if not broken:
-                progress.discard()
+        if not broken:
+            remove_items(self.path)
 
     def _rows(self, session: Session, images: Sequence[dict[str, Any]]) -> Ints:
         """Return the rows of `session.images` of images in the retrieval file; raise if the session lacks one."""

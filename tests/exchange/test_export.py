@@ -100,13 +100,13 @@ def test_the_map_is_that_of_the_features_that_the_run_localized_with(
 ) -> None:
     """A run with SuperPoint has no `hl_map.npz`; one with two kinds of features has two maps."""
     local_map = LocalMap.load(run.maps / "hl_map.npz")
-    (features,) = (run.features / "hl_map").glob("sift-*.h5")
+    (features,) = (run.features / "hl_map").glob("sift-*")
     store, names = FeatureStore.open(features), local_map.image_names
     files = SceneFiles(tmp_path / "run", run.scene)
     for kind in ("sift", "superpoint"):
         copy = files.features / "hl_map" / features.name.replace("sift", kind)
         copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(features, copy)
+        shutil.copytree(features, copy)
     replace(local_map, points=local_map.points + 1).save(files.maps / "hl_map-superpoint.npz")
     write_localization(files, "hl", "spot", ["hl_map-superpoint.npz"])
     one = export_colmap(files.run, files.scene, "hl", tmp_path / "one", small_capture)
@@ -122,8 +122,8 @@ def test_the_map_is_that_of_the_features_that_the_run_localized_with(
         seen = np.flatnonzero([p.has_point3D() for p in image.points2D])
         keypoints = np.unique(local_map.observations(index)[0])
         np.testing.assert_array_equal(seen, np.concatenate([keypoints, keypoints + count]))
-    shutil.copyfile(features, copy.with_name("superpoint-0.h5"))  # of other settings
-    with pytest.raises(ArtifactError, match="2 files of superpoint features"):
+    shutil.copytree(features, copy.with_name("superpoint-0"))  # of other settings
+    with pytest.raises(ArtifactError, match="2 folders of superpoint features"):
         export_colmap(files.run, files.scene, "hl", tmp_path / "third", small_capture)
 
 

@@ -1,6 +1,5 @@
 """Files of features and matches: what they give back, and that they never give old features for new."""
 
-import json
 import os
 import shutil
 import signal
@@ -10,7 +9,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import cv2
-import h5py
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -20,28 +18,23 @@ from tests.features.test_sift import assert_same, textured
 from toolkit.capture import Session, write_session
 from toolkit.capture.images import read_image
 from toolkit.errors import ArtifactError
-from toolkit.features import groups, stores
-from toolkit.features.features import (
-    LocalFeatures,
-)
-from toolkit.features.groups import GroupWriter
+from toolkit.features import stores
+from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import (
     MutualMatcher,
     PairMatches,
-    unit_descriptors,
 )
 from toolkit.features.sift import SiftExtractor, SiftSettings
 from toolkit.features.stores import (
     FeatureStore,
     MatchStore,
-    as_stored,
     extract_session,
     features_path,
-    group_names,
+    match_name,
     match_sessions,
     write_matches,
 )
-from toolkit.files import is_current, sidecar_path
+from toolkit.store.items import Items
 
 
 @pytest.fixture
@@ -96,9 +89,9 @@ def test_store_holds_every_photograph_as_the_extractor_gives_it(session: Session
         store["ios_map/raw_data/nowhere.png"]
 
 
-def test_what_a_file_gives_back_is_known_without_writing_it(session: Session, tmp_path: Path) -> None:
+def test_a_folder_gives_back_what_was_extracted(session: Session, tmp_path: Path) -> None:
     class Edge:
-        """Gives keypoints next to the border, where a shift by half a pixel costs bits of a float32."""
+        """Gives keypoints next to the border, where a shift by half a pixel would cost bits of a float32."""
 
         color, batch_size, threaded = False, 1, False
         settings: ClassVar[dict[str, Any]] = {"name": "edge"}
@@ -106,7 +99,7 @@ def test_what_a_file_gives_back_is_known_without_writing_it(session: Session, tm
         def __init__(self, descriptors: NDArray[Any]):
             self.features = LocalFeatures(
                 np.float32([[0.1, 0.2], [0.49999, 7], [3.3, 1e-6]]), *np.float32([[1, 2, 3], [0.3, 0.2, 0.1]]),
-                descriptors, (320, 240),
+                descriptors, (320, 240), 3,
             )  # fmt: skip
 
         def extract(self, images: list[NDArray[np.uint8]]) -> list[LocalFeatures]:
@@ -116,12 +109,9 @@ def test_what_a_file_gives_back_is_known_without_writing_it(session: Session, tm
     for dtype in (np.uint8, np.float16, np.float32):
         edge = Edge((rng.random((3, 8)) * 200).astype(dtype))
         written = extract_session(session, tmp_path / np.dtype(dtype).name, edge)[session.image_name(0)]
-        stored = as_stored(edge.features)
-        assert_same(written, stored)
-        assert stored.descriptors.dtype == written.descriptors.dtype == dtype
-        np.testing.assert_array_equal(stored.descriptors, edge.features.descriptors)
-        assert (stored.keypoints != edge.features.keypoints).any(), "this is why it matters"
-    assert_same(as_stored(SIFT.extract([textured(0)])[0]), extract(session, tmp_path / "f")[session.image_name(0)])
+        assert_same(written, edge.features)
+        assert written.descriptors.dtype == dtype
+        assert written.turns == 3
 
 
 def test_a_second_call_reads_no_image_and_gives_the_same(
@@ -204,47 +194,48 @@ def test_unreadable_images_are_listed_and_the_others_are_not_lost(
     assert session.image_name(5) in repaired
 
 
+def shard_of(store: FeatureStore) -> Path:
+    (shard,) = store.path.iterdir()
+    return shard
+
+
 @pytest.mark.parametrize("keep", [0, 100, 0.5, -1])
 def test_a_torn_file_is_made_anew(
     session: Session, tmp_path: Path, keep: float, caplog: pytest.LogCaptureFixture
 ) -> None:
     store = extract(session, tmp_path / "features")
-    content = store.path.read_bytes()
+    shard = shard_of(store)
+    content = shard.read_bytes()
     size = len(content) - 1 if keep == -1 else int(keep * len(content)) if 0 < keep < 1 else int(keep)
-    store.path.write_bytes(content[:size])
-    assert sidecar_path(store.path).exists()  # the record says that all is well
+    shard.write_bytes(content[:size])
     again = extract(session, tmp_path / "features")
-    assert f"{store.path} is torn" in caplog.text
+    assert f"{shard} is damaged" in caplog.text
     for row in (0, 2, 3, 4, 5):
         name = session.image_name(row)
         assert_same(again[name], SiftExtractor(SETTINGS).extract([textured(row)])[0])
     assert again.fingerprint == store.fingerprint
-    assert store.path.stat().st_size > 0.9 * len(content)
+    assert shard_of(store).stat().st_size == len(content)
 
 
-def test_a_file_of_the_right_size_that_is_no_hdf5_is_made_anew(session: Session, tmp_path: Path) -> None:
+def test_open_refuses_a_folder_without_features(session: Session, tmp_path: Path) -> None:
     store = extract(session, tmp_path / "features")
-    store.path.write_bytes(b"\0" * store.path.stat().st_size)
-    assert_same(extract(session, tmp_path / "features")[session.image_name(0)], SIFT.extract([textured(0)])[0])
+    shard_of(store).write_bytes(b"torn")
+    for path in (store.path, tmp_path / "nowhere"):
+        with pytest.raises(ArtifactError, match="no local features"):
+            FeatureStore.open(path)
 
 
-def test_open_refuses_a_torn_file_and_one_of_something_else(session: Session, tmp_path: Path) -> None:
-    path = extract(session, tmp_path / "features").path
-    path.write_bytes(path.read_bytes()[:1000])
-    with pytest.raises(ArtifactError, match="cannot be read"):
-        FeatureStore.open(path)
-    with h5py.File(tmp_path / "other.h5", "w") as file:
-        file["numbers"] = np.zeros(3)
-    with pytest.raises(ArtifactError, match="no local features"):
-        FeatureStore.open(tmp_path / "other.h5")
-
-
-def test_a_file_without_its_record_is_made_anew(
-    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_features_of_older_versions_are_not_used_and_that_is_said(
+    session: Session, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    sidecar_path(extract(session, tmp_path / "features").path).unlink()
-    seen = count_reads(monkeypatch)
-    assert len(extract(session, tmp_path / "features")) == len(seen) == 5
+    folder = tmp_path / "features" / session.id
+    folder.mkdir(parents=True)
+    (folder / "sift-0123456789abcdef.h5").write_bytes(b"")
+    assert len(extract(session, tmp_path / "features")) == 5
+    assert f"{folder}: features in .h5 files" in caplog.text
+    caplog.clear()
+    extract(session, tmp_path / "features")
+    assert not caplog.text
 
 
 def test_a_stopped_run_keeps_what_it_finished(
@@ -255,7 +246,6 @@ def test_a_stopped_run_keeps_what_it_finished(
             raise KeyboardInterrupt
         return read_image(path, gray)
 
-    monkeypatch.setattr(groups, "PART_GROUPS", 2)
     monkeypatch.setattr(stores, "read_image", stopped)
     with pytest.raises(KeyboardInterrupt):
         extract(session, tmp_path / "features", workers=1)
@@ -264,24 +254,23 @@ def test_a_stopped_run_keeps_what_it_finished(
     store = extract(session, tmp_path / "features")
     assert sorted(seen) == ["b/images/0.png", "b/images/1.png"]
     assert len(store) == 5
-    assert sorted(path.name for path in store.path.parent.iterdir()) == [
-        store.path.name, sidecar_path(store.path).name
-    ]  # fmt: skip
+    assert [path.name for path in store.path.parent.iterdir()] == [store.path.name]
 
 
 KILLED = """
 import os, signal, sys
 import numpy as np
-from toolkit.features import groups, sift, stores
+from toolkit.features import sift, stores
 from toolkit.capture import Session
+from toolkit.store import items
 
 folder, out = sys.argv[1:]
-groups.PART_GROUPS = 2
+items.SHARD_SECONDS = 0.0
 class Killed(sift.SiftExtractor):
     count = 0
     def extract(self, images):
         self.count += 1
-        if self.count == 4:  # two images are in a whole part, the third in one that is being written
+        if self.count == 4:
             os.kill(os.getpid(), signal.SIGKILL)
         return super().extract(images)
 killed = Killed(sift.SiftSettings(min_long_side=0, max_keypoints=200))
@@ -290,30 +279,26 @@ stores.extract_session(Session.open(folder), out, killed, progress=False)
 """
 
 
-def test_a_killed_writer_loses_no_more_than_a_part(
+def test_a_killed_writer_loses_no_more_than_a_shard(
     session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "features"
-    first = extract(session, out, rows=np.array([5]))  # a whole file is already there
+    first = extract(session, out, rows=np.array([5]))  # an image is already there
     ended = subprocess.run([sys.executable, "-c", KILLED, str(session.path), str(out)], check=False)
     assert ended.returncode == -signal.SIGKILL
-    left = list(first.path.parent.glob(f".{first.path.name}.parts/.*partial*"))
-    assert len(left) == 1  # torn, under a name that nobody takes for a part
-    left[0].rename(left[0].with_name("00001.h5"))  # and under one that might be
     seen = count_reads(monkeypatch)
     store = extract(session, out)
-    assert sorted(seen) == ["a/images/2.png", "b/images/0.png"]
+    assert sorted(seen) == ["b/images/0.png"]
     for row in (0, 2, 3, 4, 5):
         assert_same(store[session.image_name(row)], SIFT.extract([textured(row)])[0])
-    assert not list(first.path.parent.glob(".*"))
+    assert not list(first.path.parent.rglob(".*"))
 
 
-def test_the_record_beside_a_file_says_what_it_was_made_from(session: Session, tmp_path: Path) -> None:
+def test_a_folder_says_what_it_was_made_from(session: Session, tmp_path: Path) -> None:
     store = extract(session, tmp_path / "features")
-    record = json.loads(sidecar_path(store.path).read_text())["settings"]
-    assert record["made_by"]["max_keypoints"] == 200
-    assert record["groups"] == store.made_from
-    assert is_current(store.path, record)
+    opened = FeatureStore.open(store.path)
+    assert opened.settings == store.settings == SIFT.settings
+    assert opened.made_from == store.made_from
     assert store.path == features_path(tmp_path / "features", "ios_map", SIFT.settings)
 
 
@@ -324,52 +309,6 @@ def test_an_image_that_is_listed_twice_is_there_once(session: Session, tmp_path:
     twice = Session.open(session.path)
     assert len(twice.camera_rows) == 5
     assert len(extract(twice, tmp_path / "features")) == 5
-
-
-def hloc_features(path: Path, name: str) -> dict[str, NDArray]:
-    """Read an image's features as hloc's matcher does, and its keypoints as hloc's triangulation does."""
-    with h5py.File(str(path), "r", libver="latest") as file:
-        return {key: item.__array__() for key, item in file[name].items()}
-
-
-def test_files_are_in_the_layout_of_hloc(session: Session, tmp_path: Path) -> None:
-    store = extract(session, tmp_path / "features")
-    name = session.image_name(0)
-    ours, theirs = store[name], hloc_features(store.path, name)
-    np.testing.assert_array_equal(theirs["keypoints"] + 0.5, ours.keypoints)  # "COLMAP origin"
-    assert theirs["descriptors"].shape == (128, len(ours))
-    np.testing.assert_array_equal(theirs["descriptors"].T.astype(np.float32), unit_descriptors(ours.descriptors))
-    np.testing.assert_allclose(np.linalg.norm(theirs["descriptors"].astype(np.float32), axis=0), 1, atol=0.02)
-    np.testing.assert_array_equal(theirs["scores"], ours.scores)
-    assert theirs["image_size"].tolist() == [320, 240]
-    with h5py.File(store.path) as file:  # every data set is an image's: hloc takes its parent for one
-        items: dict[str, bool] = {}
-        file.visititems(lambda key, item: items.update({key: isinstance(item, h5py.Dataset)}))
-        assert {key.rpartition("/")[0] for key, is_dataset in items.items() if is_dataset} == set(store)
-        assert file.attrs["top_left_pixel_center"] == 0
-
-
-def test_a_file_of_hloc_is_read(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    path = tmp_path / "feats-superpoint-n4096-r1024.h5"
-    xy = rng.uniform(0, 1000, (50, 2)).astype(np.float16)
-    descriptors = rng.normal(size=(256, 50)).astype(np.float16)
-    with h5py.File(path, "a", libver="latest") as file:
-        group = file.create_group("db/1.jpg")
-        group.create_dataset("keypoints", data=xy)
-        group["keypoints"].attrs["uncertainty"] = 1.5
-        group.create_dataset("descriptors", data=descriptors)
-        group.create_dataset("scores", data=np.ones(50, np.float16))
-        group.create_dataset("image_size", data=np.array([1000, 800]))
-    store = FeatureStore.open(path)
-    assert list(store) == ["db/1.jpg"]
-    found = store["db/1.jpg"]
-    assert found.keypoints.dtype == np.float32
-    np.testing.assert_array_equal(found.keypoints, xy.astype(np.float32) + 0.5)
-    np.testing.assert_array_equal(found.descriptors, descriptors.T)
-    np.testing.assert_array_equal(unit_descriptors(found.descriptors), descriptors.T.astype(np.float32))
-    np.testing.assert_array_equal(found.scales, np.ones(50, np.float32))
-    assert found.image_size == (1000, 800)
 
 
 class Batched:
@@ -427,52 +366,30 @@ def test_image_of_another_size_than_its_camera_is_listed(session: Session, tmp_p
 
 def test_a_damaged_file_says_what_to_do(session: Session, tmp_path: Path) -> None:
     store = extract(session, tmp_path / "features")
-    content = store.path.read_bytes()
+    content = shard_of(store).read_bytes()
     quarter = len(content) // 4
-    store.path.write_bytes(content[:quarter] + bytes(2 * quarter) + content[3 * quarter :])
+    shard_of(store).write_bytes(content[:quarter] + bytes(2 * quarter) + content[3 * quarter :])
     with pytest.raises(ArtifactError, match="is made again"):
         list(store.values())
-
-
-def hloc_matches(path: Path, name0: str, name1: str) -> tuple[NDArray[np.int64], NDArray[np.float16]]:
-    """Read the matches of a pair as hloc does."""
-    with h5py.File(str(path), "r", libver="latest") as file:
-        group = file["/".join((name0.replace("/", "-"), name1.replace("/", "-")))]
-        matches, scores = group["matches0"].__array__(), group["matching_scores0"].__array__()
-    index = np.where(matches != -1)[0]
-    return np.stack([index, matches[index]], -1), scores[index]
 
 
 NAMES = ("ios_query/raw_data/a/1.jpg", "hl_map/raw_data/b/2.jpg")
 
 
-@pytest.mark.parametrize(("count", "kind"), [(100, np.int16), (40_000, np.int32)])
-def test_matches_are_in_the_layout_of_hloc_and_come_back(tmp_path: Path, count: int, kind: type) -> None:
-    path = tmp_path / "matches.h5"
-    indices = np.array([[0, count - 1], [3, 0], [99, 7]])
+@pytest.mark.parametrize("count", [100, 40_000, 70_000])
+def test_matches_come_back_in_either_order(tmp_path: Path, count: int) -> None:
+    indices = np.array([[3, 0], [0, count - 1], [99, 7]])
     matches = PairMatches(indices, np.array([0.5, 1.0, 0.25], np.float32))
-    with GroupWriter(path, {"name": "test"}) as writer:
-        write_matches(writer, group_names([NAMES])[NAMES], "key", (100, count), matches)
-        writer.finish()
-    found, scores = hloc_matches(path, *NAMES)
-    with h5py.File(path) as file:
-        assert file["ios_query-raw_data-a-1.jpg/hl_map-raw_data-b-2.jpg/matches0"].dtype == kind
-    np.testing.assert_array_equal(found, indices)
-    np.testing.assert_array_equal(scores, matches.scores)
-    store = MatchStore(path)
-    np.testing.assert_array_equal(store[NAMES].indices, indices)
-    np.testing.assert_array_equal(store[NAMES].scores, matches.scores)
-    np.testing.assert_array_equal(store[NAMES[::-1]].indices, indices[:, ::-1])
+    with Items(tmp_path / "matches") as items:
+        write_matches(items, match_name(*NAMES), "key", matches)
+    store = MatchStore(tmp_path / "matches")
+    np.testing.assert_array_equal(store[NAMES].indices, indices[[1, 0, 2]])
+    np.testing.assert_array_equal(store[NAMES].scores, matches.scores[[1, 0, 2]])
+    np.testing.assert_array_equal(store[NAMES[::-1]].indices, indices[[1, 0, 2], ::-1])
+    assert store[NAMES].indices.dtype == np.int64
+    assert store[NAMES].scores.dtype == np.float32
     with pytest.raises(KeyError):
         store["other.jpg", NAMES[1]]
-    torn = tmp_path / "torn.h5"
-    torn.write_bytes(path.read_bytes()[:600])
-    with pytest.raises(ArtifactError, match="Match again"):
-        MatchStore(torn)[NAMES]
-    content = path.read_bytes()
-    torn.write_bytes(content[: len(content) // 8] + bytes(len(content) - len(content) // 8))
-    with pytest.raises(ArtifactError, match=r"run its stage again|Match again"):
-        MatchStore(torn)[NAMES]
 
 
 class Counting(MutualMatcher):
@@ -539,4 +456,3 @@ def test_names_that_differ_in_dash_and_slash_alone_keep_their_own_matches(tmp_pa
     assert matcher.calls == [2, 1]  # the second time, all are there
     match_sessions((features, features), pairs[:1], matcher, tmp_path, sessions)
     assert matcher.calls == [2, 1]
-    hloc_matches(store.path, *pairs[2])

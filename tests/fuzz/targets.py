@@ -24,12 +24,12 @@ from toolkit.capture.check import check_capture
 from toolkit.capture.tables import read_query_table
 from toolkit.errors import ToolkitError
 from toolkit.exchange import interchange
+from toolkit.exchange.hloc import import_features
 from toolkit.exchange.interchange import import_colmap, import_images
-from toolkit.features.groups import GroupWriter
-from toolkit.features.stores import FeatureStore
 from toolkit.files import read_references
 from toolkit.localizers.correspondences import Correspondences, LocalizedQueries, LocalizedQuery
 from toolkit.manifest import load_manifest
+from toolkit.store.hdf5 import write_groups
 
 
 @dataclass(frozen=True)
@@ -192,10 +192,8 @@ def write_queries(path: Path) -> bytes:
     arrays = localized_query().arrays()
     features = {"keypoints": np.ones((4, 2), np.float32), "descriptors": np.ones((8, 4), np.float32)}
     features |= {"scales": np.ones(4, np.float32), "scores": np.ones(4, np.float32), "image_size": np.array([8, 6])}
-    with GroupWriter(path, {"made": 1}, {"maps": '["ios_map.npz"]', "top_left_pixel_center": 0.0}) as writer:
-        for name in HDF5_NAMES:
-            writer.add(name, "x", arrays | features)
-        writer.finish()
+    groups = ((name, arrays | features) for name in HDF5_NAMES)
+    write_groups(path, groups, {"maps": '["ios_map.npz"]', "top_left_pixel_center": 0.0})
     with h5py.File(path, "a") as file:  # a file made by somebody else has no checksums, or right ones
         for name in HDF5_NAMES:
             file[name].attrs.clear()
@@ -315,7 +313,8 @@ def check_query(query: LocalizedQuery) -> None:
 
 
 def use_features(path: Path) -> None:
-    store = FeatureStore.open(path)
+    shutil.rmtree(workplace() / "features", ignore_errors=True)
+    store = import_features(path, workplace() / "features")
     for name in store:
         features = store[name]
         count = len(features.keypoints)

@@ -6,18 +6,16 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.localized import some_correspondences
+from tests.localized import some_correspondences, write_queries
 from toolkit.errors import ArtifactError
-from toolkit.features.groups import CHECKSUM, GroupWriter
 from toolkit.geometry import make_pose
 from toolkit.localizers.correspondences import (
-    MAPS,
     Correspondences,
     LocalizedQueries,
     LocalizedQuery,
     Rival,
-    query_group,
 )
+from toolkit.store.hdf5 import CHECKSUM
 
 NAMES = ["ios_map/raw_data/1.jpg", "ios_map/raw_data/morning walk/2.jpg"]
 QUERIES = {
@@ -39,23 +37,10 @@ QUERIES = {
 }
 
 
-def write(path: Path, queries: dict[tuple[int, str], LocalizedQuery], finish: bool = True) -> None:
-    """Add queries to a file as the localize stage does."""
-    with GroupWriter(path, {"settings": 1}, {MAPS: '["ios_map.npz"]'}) as writer:
-        for key, query in queries.items():
-            writer.add(query_group(*key), arrays=query.arrays())
-        if finish:
-            writer.finish()
-
-
 @pytest.fixture
 def stored(tmp_path: Path) -> LocalizedQueries:
-    """The queries, written by two runs, the first of which was stopped."""
     path = tmp_path / "poses" / "pair.h5"
-    first = dict(list(QUERIES.items())[:2])
-    write(path, first, finish=False)
-    assert not path.exists()
-    write(path, {key: query for key, query in QUERIES.items() if key not in first})
+    write_queries(path, QUERIES, ["ios_map.npz"])
     return LocalizedQueries(path)
 
 

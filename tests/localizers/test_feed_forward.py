@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-import h5py
 import numpy as np
 import pandas as pd
 import pytest
@@ -32,6 +31,7 @@ from toolkit.localizers.prediction import Prediction
 from toolkit.localizers.simulated import SimulatedPredictor
 from toolkit.show.figures import save_figure
 from toolkit.show.visualize_prediction import draw_prediction
+from toolkit.store.items import Items
 
 Floats = NDArray[np.float64]
 
@@ -452,9 +452,7 @@ def test_a_killed_run_goes_on_where_it_was(
         with pytest.raises(KeyboardInterrupt):
             run_stage(small_capture, run, query_device="ios", predictor={"batch_size": 1})
     assert not run.poses_txt("ios", "ios").exists()
-    (part,) = run.poses_dir.glob(".*.parts/*.h5")
-    with h5py.File(part) as file:
-        assert sum(len(devices) for devices in file.values()) == 2
+    assert len(Items(run.poses_txt("ios", "ios").with_suffix(".items"))) == 2
     monkeypatch.setattr(FeedForwardLocalizer, "predict", counted)
     table = run_stage(small_capture, run, query_device="ios")
     assert len(asked) == table["queries"].iloc[0] - 2

@@ -25,8 +25,6 @@ from toolkit.capture import Capture
 from toolkit.capture.names import ALLOW_OUTSIDE
 from toolkit.embed import embed_sessions
 from toolkit.errors import DamagedError, ImageError, ManifestError, ToolkitError
-from toolkit.features import groups
-from toolkit.features.groups import GroupWriter
 from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import Remade, SceneFiles
@@ -37,6 +35,8 @@ from toolkit.manifest import MapSettings
 from toolkit.retrieve import retrieve_pairs
 from toolkit.runs import cluster as clusters
 from toolkit.runs.cluster import ADDRESS, Cluster, current_cluster, open_cluster
+from toolkit.store import items as item_store
+from toolkit.store.items import Items
 
 LIST = "keyframes_pruned_subsampled"
 
@@ -69,7 +69,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> Here:
             frame = frame.f_back  # type: ignore[assignment]
         return cluster
 
-    for module in ("toolkit.features.groups", "toolkit.localizers.mapping"):
+    for module in ("toolkit.store.items", "toolkit.localizers.mapping"):
         monkeypatch.setattr(f"{module}.current_cluster", current)
     return cluster
 
@@ -81,44 +81,44 @@ def items_of(numbers: Sequence[int]) -> list[tuple[str, str, int]]:
     return [(f"{number}", f"from {number}", number) for number in numbers]
 
 
-def write(writer: GroupWriter, items: Sequence[tuple[str, str, int]], fail_at: int | None = None) -> None:
-    for name, source, number in items:
+def write(items: Items, todo: Sequence[tuple[str, str, int]], fail_at: int | None = None) -> None:
+    for name, source, number in todo:
         if number == fail_at:
             raise ImageError("no more")
-        writer.add(name, source, {"value": np.array([number])}, note=number)
+        items.add(name, source, {"value": np.array([number])}, number)
 
 
-def do_share(share: str, numbers: Sequence[int], path: Path, fail_at: int | None = None) -> None:
-    groups._do_share((path, {"by": 1}, {}, share), items_of(numbers), GroupWriter.left, write, (fail_at,))
+def do_share(folder: Path, numbers: Sequence[int], fail_at: int | None = None, since: int = 0) -> None:
+    item_store._do_share(folder, {"by": 1}, since, items_of(numbers), write, (fail_at,))
 
 
-def test_a_writer_takes_what_others_made(tmp_path: Path, here: Here) -> None:
-    path = tmp_path / "file.h5"
-    with GroupWriter(path, {"by": 1}) as writer:
-        writer.add("0", "old", {"value": np.array([-1])}, note=-1)
-        assert writer.spread(write, items_of(range(20)), (), "write", "group") == []
-        assert writer.notes() == {str(item): item for item in range(20)}
-        assert {name: int(arrays["value"][0]) for name, arrays in writer.read()} == writer.notes()
-        writer.annotate("3", "annotated")
-    with GroupWriter(path, {"by": 1}) as writer:  # what comes last counts, in the next run too
-        assert writer.notes()["3"] == "annotated"
-        writer.spread(write, items_of([3]), (), "write", "group")
-        assert writer.notes()["3"] == 3
-        writer.finish()
-    assert [path.name for path in sorted(tmp_path.iterdir())] == ["file.h5", "file.h5.meta.json"]
+def notes(items: Items) -> dict[str, int]:
+    return {name: items.note(name) for name in items}
 
 
-def test_a_share_goes_on_where_it_was_and_leaves_others_alone(tmp_path: Path) -> None:
-    path = tmp_path / "file.h5"
-    do_share("00000-00001-", range(5), path)
+@pytest.mark.parametrize("again", [False, True])
+def test_workers_write_to_the_same_folder(tmp_path: Path, here: Here, again: bool) -> None:
+    with Items(tmp_path, {"by": 1}) as items:
+        items.add("0", "old", {"value": np.array([-1])}, -1)
+        items.add("1", "from 1", {"value": np.array([-1])}, -1)
+    with Items(tmp_path, {"by": 1}, again=again) as items:
+        assert items.spread(write, items.left(items_of(range(20))), (), "write", "item") == []
+        assert notes(items) == {str(item): item for item in range(20)} | ({} if again else {"1": -1})
+        assert {name: int(arrays["value"][0]) for name, arrays in items.items()} == notes(items)
+    assert all(path.suffix == ".shard" for path in tmp_path.iterdir())
+
+
+def test_a_share_goes_on_where_it_was_and_leaves_others_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    do_share(tmp_path, range(5))
     with pytest.raises(ImageError):
-        do_share("00000-00000-", range(5, 10), path, fail_at=8)
-    parts = {part.name: part.stat().st_mtime_ns for part in (tmp_path / ".file.h5.parts").iterdir()}
-    do_share("00000-00000-", range(5, 10), path, fail_at=7)  # which is there
-    now = {part.name: part.stat().st_mtime_ns for part in (tmp_path / ".file.h5.parts").iterdir()}
-    assert now.items() > parts.items()
-    with GroupWriter(path, {"by": 1}) as writer:
-        assert sorted(writer.notes().values()) == list(range(10))
+        do_share(tmp_path, range(5, 10), fail_at=8)
+    before = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    do_share(tmp_path, range(5, 10), fail_at=7)  # which is there
+    now = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    assert now.items() > before.items()
+    assert sorted(notes(Items(tmp_path)).values()) == list(range(10))
 
 
 @pytest.mark.parametrize(("items", "multiple", "lengths"), [(0, 1, []), (3, 1, [1] * 3), (20, 1, [3] * 6 + [2]),
@@ -169,7 +169,7 @@ def test_features_and_maps_are_those_of_one_process(small_capture: Path, tmp_pat
         if name == "alone":
             here.labels, labels = [], here.labels
             clusters_off = pytest.MonkeyPatch()
-            for module in (groups, mapping):
+            for module in (item_store, mapping):
                 clusters_off.setattr(module, "current_cluster", lambda: None)
         features = extract_session(session, tmp_path / name)
         build_map(session, features, tmp_path / name / "ios_map.npz", settings)
@@ -182,7 +182,7 @@ def test_features_and_maps_are_those_of_one_process(small_capture: Path, tmp_pat
         np.testing.assert_array_equal(made["cluster"][image].descriptors, made["alone"][image].descriptors)
     maps = [(tmp_path / name / "ios_map.npz").read_bytes() for name in ("cluster", "alone")]
     assert maps[0] == maps[1]
-    assert not list(tmp_path.rglob("*.parts"))
+    assert not list(tmp_path.rglob(".*"))
 
 
 @pytest.mark.slow
@@ -203,7 +203,7 @@ def test_poses_are_those_of_one_process(
         place = SceneFiles(tmp_path / name, small_capture.name)
         with pytest.MonkeyPatch.context() as patch:
             if name == "alone":
-                for module in ("toolkit.features.groups", "toolkit.localizers.mapping"):
+                for module in ("toolkit.store.items", "toolkit.localizers.mapping"):
                     patch.setattr(f"{module}.current_cluster", lambda: None)
             folders = files.retrieval_dir, place.poses_dir, files.features, place.maps
             localize_pairs(sessions, *folders, settings, map_device="ios")
@@ -458,8 +458,8 @@ def test_a_killed_worker_changes_no_pose(
     killed: list[int] = []
 
     def kill_one() -> None:
-        parts = tmp_path / "cluster" / f".{long_queries[0].name}_map_ios_query_ios.h5.parts"
-        while len(list(parts.glob("*.meta.json"))) < 4:
+        items = tmp_path / "cluster" / f"{long_queries[0].name}_map_ios_query_ios.items"
+        while len(list(items.glob("*.shard"))) < 4:
             time.sleep(0.05)
         address = os.environ[ADDRESS]
         pids = clusters._client(address).run(os.getpid)
@@ -471,7 +471,7 @@ def test_a_killed_worker_changes_no_pose(
         killer.start()
         assert localized(*long_queries, tmp_path / "cluster") == alone
     assert killed
-    assert not list((tmp_path / "cluster").glob(".*.parts"))
+    assert not list((tmp_path / "cluster").rglob(".*"))
 
 
 @contextmanager

@@ -7,11 +7,11 @@ import pytest
 import yaml
 
 from toolkit.errors import ManifestError
-from toolkit.features.groups import GroupWriter
 from toolkit.files import SceneFiles
 from toolkit.manifest import load_manifest
 from toolkit.pipeline import sweep
 from toolkit.runs.sweep import changed_keys, swept_runs, take_over, variant_name
+from toolkit.store.items import Items
 
 
 def test_a_run_a_value() -> None:
@@ -88,16 +88,17 @@ def test_a_run_that_is_there_is_left_as_it_is(tmp_path: Path) -> None:
 
 def test_what_is_added_to_a_linked_file_is_not_in_the_other_run(tmp_path: Path) -> None:
     donor, mine = SceneFiles(tmp_path / "a", "P"), SceneFiles(tmp_path / "b", "P")
-    with GroupWriter(donor.features / "made.h5", {"made": "by"}) as writer:
-        writer.add("first", "source", {"values": np.zeros(3)})
-        writer.finish()
-    before = (donor.features / "made.h5").read_bytes()
+    with Items(donor.features / "made") as items:
+        items.add("first", "source", {"values": np.zeros(3)})
+    (shard,) = (donor.features / "made").iterdir()
+    before = shard.read_bytes()
     take_over(donor.run, mine.run, ["P"], ["localize.method"])
-    with GroupWriter(mine.features / "made.h5", {"made": "by"}) as writer:
-        assert list(writer.index.groups) == ["first"]
-        writer.add("second", "source", {"values": np.ones(3)})
-        writer.finish()
-    assert (donor.features / "made.h5").read_bytes() == before
+    with Items(mine.features / "made") as items:
+        assert list(items) == ["first"]
+        items.add("first", "source", {"values": np.ones(3)})
+        items.add("second", "source", {"values": np.ones(3)})
+    assert shard.read_bytes() == before
+    assert list((donor.features / "made").iterdir()) == [shard]
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 `names="own"` gives images the names that the user knows (`files.own_name`): an imported image has its path in the
 folder it was imported from, other images have their path relative to the capture's folder `sessions`. With
-`names="capture"` all paths are relative to `sessions`, as in the HDF5 files of local features and matches.
+`names="capture"` all paths are relative to `sessions`, as in files of local features and matches, see `exchange.hloc`.
 
 The run records where its captures are; `capture` is the new folder of one that has moved. All exports raise
 ManifestError for an unknown choice of names, a capture that is in neither place, or a capture with another name.
@@ -90,13 +90,19 @@ def _maps_of(files: SceneFiles, device: str) -> list[Path]:
 def _features_of(files: SceneFiles, session_id: str, map_file: Path) -> FeatureStore:
     """Open the local features that a map was triangulated from."""
     kind = map_file.stem.removeprefix(session_id).removeprefix("-") or "sift"  # the naming of `mapping.map_path`
-    stores = sorted((files.features / session_id).glob(f"{kind}-*.h5"))
+    return FeatureStore.open(only_features(files, session_id, kind))
+
+
+def only_features(files: SceneFiles, session_id: str, kind: str) -> Path:
+    """Return the folder of a session's features of a kind. Raise ArtifactError if a run has none or several."""
+    folder = files.features / session_id
+    stores = [path for path in sorted(folder.glob(f"{kind}-*")) if path.is_dir()]
     if len(stores) != 1:
         raise ArtifactError(
-            f"{files.features / session_id}: {len(stores)} files of {kind} features, expected the one that {map_file} "
-            "was triangulated from. Delete this folder and run the localize stage again."
+            f"{folder}: {len(stores)} folders of {kind} features, expected the one that the run localized with. Delete "
+            "this folder and run the localize stage again."
         )
-    return FeatureStore.open(stores[0])
+    return stores[0]
 
 
 def _pooled(maps: Sequence[LocalMap], stores: Sequence[FeatureStore]) -> tuple[LocalMap, Keypoints]:

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolkit.errors import ArtifactError, DamagedError, first_line
-from toolkit.features.groups import HDF5_ERRORS, group_names_of, has_group, read_group
 from toolkit.geometry import Floats, Ints
+from toolkit.store.hdf5 import HDF5_ERRORS, group_names_of, has_group, read_group
 
 MAPS = "maps"
 """File attribute: names of the triangulated maps in the folder of maps, one per kind of features."""
@@ -89,15 +89,14 @@ class LocalizedQuery:
     """Clearly different poses that matches support, best supported first; None in files of older runs."""
 
     def arrays(self) -> dict[str, Any]:
-        """Return the datasets of the query's group, by name."""
+        """Return the datasets of the query's group, by name; texts as objects."""
         arrays = dict(vars(self.correspondences))
         labels, codes = np.unique(arrays.pop("found_by"), return_inverse=True)
-        text = h5py.string_dtype()
-        names = {name: np.array(getattr(self, name), object).astype(text) for name in _NAMES}
+        names = {name: np.array(getattr(self, name), object) for name in _NAMES}
         # float32 makes the file smaller and keeps pixels of any image exact to a hundredth.
         arrays |= {key: arrays[key].astype(np.float32) for key in ("pixels", "view_pixels")}
         arrays |= {key: arrays[key].astype(np.int32) for key in ("camera", "point_index", "view_of", "view_reference")}
-        arrays |= {"found_by": codes.astype(np.uint8), "found_by_labels": labels.astype(object).astype(text)}
+        arrays |= {"found_by": codes.astype(np.uint8), "found_by_labels": labels.astype(object)}
         if self.rivals is not None:
             arrays["rivals"] = np.array([rival.world_from_rig for rival in self.rivals]).reshape(-1, 4, 4)
             arrays["rival_supports"] = np.array([rival.support for rival in self.rivals], np.float64)

@@ -8,7 +8,6 @@ from toolkit import geometry
 from toolkit.capture.images import pixels_of
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
 from toolkit.features.matching import AnyMethod
-from toolkit.features.stores import as_stored
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.base import SEARCH_DEG, Localizer, PoseEstimate, Prior, Query, QueryInput, References, rank
 
@@ -117,6 +116,6 @@ class EscalatingLocalizer:
             for method in self._further:
                 pixels = pixels_of(view.image, gray=not method.extractor.color)
                 turns = view.turns if KINDS[method.name].upright else 0
-                further.append(as_stored(extract_turned(method.extractor, [pixels], [turns])[0]))
+                further += extract_turned(method.extractor, [pixels], [turns])
             features.append([*first, *further])
         return replace(query, features=features, network_matches=[])

@@ -23,9 +23,8 @@ from toolkit.embedders.search import search
 from toolkit.embedders.stored import embedder_fingerprint
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.features.features import KINDS, extract_turned
-from toolkit.features.groups import HDF5_ERRORS
 from toolkit.features.matching import AnyMethod, DeferredMethod, LocalMethod, create_local_methods, weights_files
-from toolkit.features.stores import FeatureStore, OnDemandFeatures, as_stored, extract_session
+from toolkit.features.stores import FeatureStore, OnDemandFeatures, extract_session
 from toolkit.features.verification import Verifier
 from toolkit.files import (
     SceneFiles,
@@ -33,10 +32,8 @@ from toolkit.files import (
     fingerprint,
     image_name,
     pair_devices,
-    read_sidecar,
     require_current,
     write_atomic,
-    write_sidecar,
 )  # fmt: skip
 from toolkit.geometry import Floats, Ints, unit
 from toolkit.localizers.base import Localizer, PoseEstimate, References, RoughPose, ScaledLocalizer
@@ -54,6 +51,7 @@ from toolkit.localizers.prediction import Predictor
 from toolkit.localizers.predictors import open_predictor
 from toolkit.localizers.survey import NOMINAL_DEPTH, USUAL_DEPTHS_M
 from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings, Settings, nearest
+from toolkit.store.hdf5 import HDF5_ERRORS
 
 log = logging.getLogger(__name__)
 
@@ -476,7 +474,7 @@ class Map:
         settings, rows = verifier.settings, ranked[0][: verifier.settings.topn]
         pixels = picture(method.extractor.color)
         turns = turns if KINDS[method.name].upright else 0
-        features = as_stored(extract_turned(method.extractor, [pixels], [turns])[0])
+        (features,) = extract_turned(method.extractor, [pixels], [turns])
         readable = [index for index, row in enumerate(rows) if self.session.image_name(int(row)) in verifier.store]
         inliers = np.zeros(len(rows))
         inliers[readable], _ = verifier.verify(
@@ -690,11 +688,8 @@ def update_attributes(path: Path, attributes: Mapping[str, str]) -> bool:
     with h5py.File(path, "r") as file:
         current = {name: file.attrs.get(name) for name in attributes} == dict(attributes)
     if not current:
-        record = read_sidecar(path)
         with write_atomic(path) as temporary:
             shutil.copyfile(path, temporary)
             with h5py.File(temporary, "a", libver="latest") as file:
                 file.attrs.update(attributes)
-        if record is not None:
-            write_sidecar(path, record, checksums=False)
     return not current

@@ -19,9 +19,8 @@ from toolkit.capture.cameras import camera_text, in_view, rays_of, view_bounds
 from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.errors import ArtifactError, ImageError
 from toolkit.features.features import KINDS, FeatureKind, LocalFeatures, feature_kind, shorten_settings
-from toolkit.features.groups import GroupWriter
 from toolkit.features.matching import PairMatches, match_along_epipolar_lines, unit_descriptors
-from toolkit.features.stores import FeatureStore, MatchStore, group_names, matches_path, write_matches
+from toolkit.features.stores import FeatureStore, MatchStore, match_name, matches_path, write_matches
 from toolkit.files import Remade, fingerprint, is_current, temporary_folder, write_sidecar
 from toolkit.geometry import Floats, Ints
 from toolkit.localizers.local_map import LocalMap
@@ -31,10 +30,11 @@ from toolkit.localizers.tiles import JoinedImages, home_of, join_tiles, plan_til
 from toolkit.localizers.triangulation import MAX_REPROJECTION_ERROR_PX, triangulate
 from toolkit.manifest import MapSettings
 from toolkit.runs.cluster import current_cluster
+from toolkit.store.items import Items
 from toolkit.threads import fixed_sums
 
 _ToMatch = tuple[str, str, int, int]
-"""A pair to match: group in the match file, fingerprint of the inputs of the matches, indices of the two images."""
+"""A pair to match: name of its item, fingerprint of the inputs of the matches, indices of the two images."""
 DEPTHS = (2.0, 4.0, 8.0, 16.0)
 """Depths at which the views of two images are compared, in map lengths (meters; see `Survey.length`)."""
 MAX_EPIPOLAR_ERROR_PX = 4.0
@@ -257,8 +257,8 @@ def _refined(given: "MapPlan", workers: int) -> "MapPlan":
     return plan
 
 
-def _match_share(writer: GroupWriter, todo: Sequence[_ToMatch], plan: "MapPlan") -> None:
-    plan.match_into(writer, todo, default_workers(), label="")
+def _match_share(items: Items, todo: Sequence[_ToMatch], plan: "MapPlan") -> None:
+    plan.match_into(items, todo, default_workers(), label="")
 
 
 class MapPlan(Remade):
@@ -364,24 +364,19 @@ class MapPlan(Remade):
     def match(self, number: int, skip_existing: bool = True, workers: int = 1) -> None:
         """Match the pairs of a tile along epipolar lines; skip pairs that are matched already."""
         pairs, names, made_from = self.pairs_of[number].tolist(), self.names, self._made_from
-        with GroupWriter(self._matches_path(number), self._matches_made_by(number)) as writer:
-            groups = group_names([(names[i], names[j]) for i, j in pairs], writer.index.groups)
-            todo = [(groups[names[i], names[j]], made_from[i] + made_from[j], i, j) for i, j in pairs]
-            todo = writer.left(todo) if skip_existing else todo
+        with Items(self._matches_path(number), self._matches_made_by(number), again=not skip_existing) as items:
+            todo = items.left((match_name(names[i], names[j]), made_from[i] + made_from[j], i, j) for i, j in pairs)
             label = f"match {self.session.id}" + (f" {number + 1}/{len(self.tiles)}" if len(self.tiles) > 1 else "")
-            todo = writer.spread(_match_share, todo, (self.of_worker,), label, "pair")
-            self.match_into(writer, todo, workers, label if todo else "", keep=len(self.tiles) == 1)
-            writer.finish()
+            todo = items.spread(_match_share, todo, (self.of_worker,), label, "pair")
+            self.match_into(items, todo, workers, label if todo else "", keep=len(self.tiles) == 1)
 
     def match_into(
-        self, writer: GroupWriter, todo: Sequence[_ToMatch], workers: int, label: str, keep: bool = False
+        self, items: Items, todo: Sequence[_ToMatch], workers: int, label: str, keep: bool = False
     ) -> None:
-        """Add the matches of pairs to a file; `keep` them in memory, too."""
-        counts: dict[int, int] = {}
+        """Add the matches of pairs to a folder; `keep` them in memory, too."""
 
         def load(index: int) -> LocalFeatures:
             features = self.features[self.names[index]]
-            counts[index] = len(features)
             if keep:
                 self._keypoints_of[index] = features.keypoints
             return features
@@ -396,8 +391,8 @@ class MapPlan(Remade):
             workers,
         )
         bar = tqdm(all_matches, total=len(todo), desc=label, unit="pair", disable=not label)
-        for (group, source, i, j), matches in zip(todo, bar, strict=True):
-            write_matches(writer, group, source, (counts[i], counts[j]), matches)
+        for (name, source, i, j), matches in zip(todo, bar, strict=True):
+            write_matches(items, name, source, matches)
             if keep:
                 self._matched[i, j] = matches.indices
 

@@ -17,7 +17,6 @@ from toolkit.errors import ArtifactError, CameraError, ImageError
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
 from toolkit.features.matching import LocalMethod
 from toolkit.features.sift import SiftExtractor
-from toolkit.features.stores import as_stored
 from toolkit.localizers.base import PoseEstimate, Prior, Query, RoughPose, View
 from toolkit.localizers.map import Map
 from toolkit.threads import fixed_sums
@@ -98,7 +97,7 @@ def _extract(map_: Map, pictures: Sequence["_Pixels"], turns: Sequence[int]) -> 
     def extract(picture: _Pixels, turn: int, kind: LocalMethod) -> LocalFeatures:
         pixels = picture.read(kind.extractor.color)
         (features,) = extract_turned(kind.extractor, [pixels], [turn if KINDS[kind.name].upright else 0])
-        return as_stored(features)  # a run reads features from its file, which rounds keypoints at the border
+        return features
 
     return [[extract(*item, kind) for kind in map_.kinds] for item in zip(pictures, turns, strict=True)]
 
@@ -115,7 +114,7 @@ def _embed(
             if features and sift.settings in settings:  # the embedder can use the features of the localizer
                 inputs = [kinds[settings.index(sift.settings)] for kinds in features]
             else:
-                inputs = [as_stored(one) for one in sift.extract([picture.read(color=False) for picture in pictures])]
+                inputs = sift.extract([picture.read(color=False) for picture in pictures])
         else:
             turned, side = map_.shows_upright(embedder), embedder.least_side
             inputs = [

@@ -1,9 +1,8 @@
 """Spread a stage's work over the workers of a Dask cluster (https://distributed.dask.org), on one machine or many.
 
-A stage cuts its work into shares and submits them before it runs itself. Each worker writes files of its own, the same
-files that a stopped run leaves (`features.groups.GroupWriter`), and the stage then resumes from them. So the results do
-not change, and if a worker dies, another one continues its share. All processes must see the same files under the same
-paths.
+A stage cuts its work into shares and submits them before it runs itself. Workers write to the same folders as the stage
+(`store.items`), which then makes what is left. So the results do not change, and if a worker dies, another one
+continues its share. All processes must see the same files under the same paths.
 """
 
 import logging

@@ -53,7 +53,7 @@ class PairRows:
             row["reason"] = ""
             note.unlink(missing_ok=True)
         except DamagedError:
-            raise  # damaged files are rebuilt, see `features.groups.heals`
+            raise  # damaged files are rebuilt, see `store.items.heals`
         except OF_THE_DATA as error:
             log.warning("%s is left out: %s", name, error)
             row.clear()
