@@ -203,16 +203,3 @@ def places_of(positions: Floats) -> Ints:
     labels = fcluster(tree, gap, "distance")[cKDTree(spots).query(positions)[1]]
     _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[inverse]
-
-
-def draw_headings(axis: "Axes", positions: Floats, poses: Floats, axes: Floats, length: float, **style: Any) -> None:
-    """Draw the viewing direction of each camera (N, 4, 4) as a line from its position (N, 2) in the picture."""
-    from matplotlib.collections import LineCollection
-
-    ends = positions + length * poses[:, :3, 2] @ axes.T
-    axis.add_collection(LineCollection(list(np.stack([positions, ends], axis=1)), **style))
-
-
-def draw_dots(axis: "Axes", xy: Floats, **style: Any) -> None:
-    """Draw positions, (N, 2) or one, (2,); `style` is passed to matplotlib's `scatter`."""
-    axis.scatter(*np.reshape(xy, (-1, 2)).T, **style)
