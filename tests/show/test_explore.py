@@ -59,7 +59,7 @@ def test_a_session_without_poses_is_not_in_the_legend(small_capture: Path, tmp_p
     capture = Path(shutil.copytree(small_capture, tmp_path / small_capture.name))
     for truth in (capture / "sessions" / "ios_query").rglob("*trajector*"):
         truth.unlink()
-    plot = draw_top_view(Capture.open(capture)).axes[0]
-    names = [text.get_text() for text in plot.get_legend().get_texts()]
+    (legend,) = draw_top_view(Capture.open(capture)).legends
+    names = [text.get_text() for text in legend.get_texts()]
     assert "hl_query" in names
     assert "ios_query" not in names

@@ -47,7 +47,7 @@ def query_images(capture, device):
 
 def drawn(axis):
     """Return the positions of the dots of an axis, in the file's pixels, a list a color."""
-    dots = [c.get_offsets() + 0.5 for c in axis.collections if not hasattr(c, "get_segments")]
+    dots = [c.get_offsets() for c in axis.collections if not hasattr(c, "get_segments")]
     return [np.asarray(xy) for xy in dots]
 
 

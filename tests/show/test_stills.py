@@ -105,9 +105,11 @@ def images(tmp_path):
     pixels, _ = project(points, CAMERA, np.eye(4))
     inlier, matches = np.array([True, True, False, True, True]), np.array([4, 7, 1, 2, 9])
     true = make_pose(np.eye(3), [0.02, 0, 0])
-    query = ShownImage("q", files[0], CAMERA, np.eye(4), pixels, points, matches, inlier, true)
+    kinds = np.array(["sift/guided"] * 5)
+    query = ShownImage("q", files[0], CAMERA, np.eye(4), pixels, points, matches, inlier, true, kinds)
     seen = [4, 0, 2]
-    reference = ShownImage("r", files[1], HIGH, np.eye(4), pixels[:3], points[seen], matches[seen], inlier[seen])
+    seen_too = points[seen], matches[seen], inlier[seen], true, kinds[seen]
+    reference = ShownImage("r", files[1], HIGH, np.eye(4), pixels[:3], *seen_too)
     return query, reference
 
 
@@ -145,7 +147,7 @@ def test_the_worst_queries_are_drawn_with_the_matches_they_share_with_a_referenc
     rejected, agreeing = (c.get_segments() for c in second.collections if hasattr(c, "get_segments"))
     # The reference, twice as high, is drawn at half its size beside the query.
     np.testing.assert_allclose([line[0] for line in agreeing], query.pixels[[0, 4]])
-    np.testing.assert_allclose([line[1] for line in agreeing], reference.pixels[[1, 0]] / 2 + [64 * 1.03, 0])
+    np.testing.assert_allclose([line[1] for line in agreeing], reference.pixels[[1, 0]] / 2 + [64 * 1.02, 0])
     np.testing.assert_allclose([line[0] for line in rejected], query.pixels[[2]])
     assert [text.get_text() for text in third.texts] == ["no common points"]
     assert [text.get_text() for text in fourth.texts] == ["no matches; rejected: contradicts the others"]

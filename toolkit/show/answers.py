@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,14 +13,27 @@ from toolkit.localizers.base import CAMERA
 from toolkit.localizers.confidence import bounded_by_rivals
 from toolkit.localizers.correspondences import Correspondences, LocalizedQuery, Rival
 from toolkit.manifest import LocalizeSettings
+from toolkit.show.figures import number
 from toolkit.show.localized import LocalizedPair, QueryDetails
-from toolkit.show.metrics import pose_errors
+from toolkit.show.metrics import is_posed, pose_errors
 
-NUMBERS = (
-    "num_inliers", "num_matches", "inlier_ratio", "num_guided", "rmse_px", "coverage", "p_correct", "rival_support",
-    "agreement", "position_std_m", "rotation_std_deg", "scale_std",
-)  # fmt: skip
-"""Numbers about a pose: columns of a pair's table, and attributes of an estimate."""
+LABELS = {
+    "num_matches": ("descriptor matches", "{:.0f}"), "num_inliers": ("inliers among them", "{:.0f}"),
+    "inlier_ratio": ("inlier ratio", "{:.0%}"), "num_guided": ("guided matches", "{:.0f}"),
+    "rmse_px": ("reprojection error [px]", "{:.2f}"), "coverage": ("image covered", "{:.0%}"),
+    "p_correct": ("probability of being right", "{:.1%}"), "rival_support": ("support of the best rival", "{:.0%}"),
+    "agreement": ("matches of a second kind", "{:.0f}"), "position_std_m": ("std. dev. of position [{unit}]", "{:.2g}"),
+    "rotation_std_deg": ("std. dev. of rotation [deg]", "{:.2g}"), "scale_std": ("std. dev. of scale", "{:.1%}"),
+}  # fmt: skip
+"""Numbers about a pose, columns of a pair's table and attributes of an estimate: label and format of each; `{unit}`
+stands for the pair's unit of length."""
+OF_NETWORKS = {
+    "num_matches": ("references given to it", "{:.0f}"), "num_inliers": ("consistent ones", "{:.0f}"),
+    "inlier_ratio": ("their share", "{:.0%}"),
+}  # fmt: skip
+"""Labels and formats that differ for poses of a feed-forward network."""
+OF_MATCHES = ("num_guided", "rmse_px", "coverage", "p_correct", "rival_support", "agreement")
+"""Numbers that a pose without matches does not have."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +45,12 @@ class Answer:
     """Number of the query in the pair."""
     status: str
     """`ok`, `low_confidence...` or `failed: ...`."""
+    stated: str
+    """Reason that the localizer states besides the status."""
     method: str
     """Method that found the pose or, without a pose, that was tried."""
-    reason: str
-    """Why it has this status, in words."""
     numbers: dict[str, float]
-    """The known ones of `NUMBERS`; lengths in `pair.unit`."""
+    """The known ones of `LABELS`; lengths in `pair.unit`."""
     localized: LocalizedQuery
     """Names of images and references, correspondences, rivals."""
     pose: Floats | None
@@ -47,8 +61,6 @@ class Answer:
     """Settings that it was localized with."""
     seconds: float
     """Time that it took."""
-    true_pose: Floats | None = None
-    """world_from_rig (4, 4); None if unknown."""
     retrieved: dict[str, tuple[int, float]] = field(default_factory=dict)
     """Rank, from 1, and score of each retrieved reference, by name; for a rig, the best rank among its cameras."""
 
@@ -64,6 +76,51 @@ class Answer:
         return f"query {self.number} of {devices}: {self.status}"
 
     @property
+    def reason(self) -> str:
+        """Why it has this status, in words."""
+        return reason_in_words(self.status, self.stated, self.numbers, self.settings, self.method)
+
+    @property
+    def caption(self) -> str:
+        """What the drawn image and its best reference see."""
+        camera, references = self.details.cameras[0], self.details.captioned_references()
+        of_rig = f" ({folder_of(camera.name)})" if len(self.details.cameras) > 1 else ""
+        counts = f"{camera.num_inliers} of {len(camera.matches)} map points agree"
+        text = f"query{of_rig}: {counts if len(camera.matches) else 'no matches were stored'}"
+        if not references:
+            return f"{text} · no reference"
+        both = np.isin(camera.matches, references[0][0].matches)
+        joined = f", {int(camera.inlier[both].sum())} of this image" if both.any() else ""
+        return f"{text} · {references[0][1]}{joined}"
+
+    @property
+    def texts(self) -> dict[str, str]:
+        """The known numbers, errors and seconds as texts by their label."""
+        by_network, unit = _is_by_network(self.method), self.pair.unit[0]
+        labels = LABELS | OF_NETWORKS if by_network else LABELS
+        hidden = set(OF_MATCHES) if by_network else set[str]()
+        if self.pose is not None and not self.numbers.get("num_matches"):
+            hidden = {*OF_MATCHES, *OF_NETWORKS}
+        if not self.numbers.get("agreement"):
+            hidden.add("agreement")
+        shown = {name: each for name, each in labels.items() if name in self.numbers and name not in hidden}
+        texts = {label.format(unit=unit): form.format(self.numbers[name]) for name, (label, form) in shown.items()}
+        texts = {"method": self.method, **texts}
+        if self.rivals is None:
+            texts["other poses"] = "not kept"
+        if self.error is not None:
+            texts[f"true position error [{unit}]"] = _digits(self.error[1])
+            texts["true rotation error [deg]"] = _digits(self.error[0])
+        return {**texts, "seconds": f"{self.seconds:.2f}"}
+
+    @property
+    def rig_from_cam(self) -> Floats:
+        """Pose of the drawn image, (4, 4)."""
+        session, rows = self.pair.query_session, self.pair.rows[self.number]
+        names = [session.image_name(int(row)) for row in rows]
+        return np.asarray(session.rig_from_cam(rows)[names.index(self.details.cameras[0].name)])
+
+    @property
     def correspondences(self) -> Correspondences:
         return self.localized.correspondences
 
@@ -77,6 +134,13 @@ class Answer:
         """Its images and references, with their correspondences."""
         no_pose = np.full((4, 4), np.nan)
         return self.pair.details(self.number, self.localized, no_pose if self.pose is None else self.pose)
+
+    @property
+    def true_pose(self) -> Floats | None:
+        """world_from_rig (4, 4); None if unknown."""
+        queries = self.pair.localizations
+        true = (queries.true @ queries.cam_from_rig)[self.number]
+        return true if is_posed(true) else None
 
     @property
     def error(self) -> tuple[float, float] | None:
@@ -118,6 +182,20 @@ class Answer:
         return f"{self.headline}\n{self.name}\n{self.reason}"
 
 
+def folder_of(name: str) -> str:
+    """Return the name of an image's folder, which tells the camera of a rig."""
+    return Path(name).parent.name
+
+
+def _is_by_network(method: str) -> bool:
+    return method.rpartition("/")[2].startswith("feed_forward")
+
+
+def _digits(value: float) -> str:
+    """Return a number with two significant digits if it is small: an error below a millimeter is not 0.000 m."""
+    return np.format_float_positional(value, 2, fractional=False, trim="-") if value < 0.1 else number(value)
+
+
 def reason_in_words(
     status: str, stated: str, numbers: Mapping[str, float], settings: LocalizeSettings, method: str = "pnp"
 ) -> str:
@@ -125,7 +203,7 @@ def reason_in_words(
 
     Args:
         stated: reason that the localizer states besides the status.
-        numbers: the known ones of `NUMBERS`.
+        numbers: the known ones of `LABELS`.
         settings: settings of the localization, which hold the limits.
         method: method of the pose; for `feed_forward`, inliers are references, not matches.
     """
@@ -170,7 +248,7 @@ def _doubts(numbers: Mapping[str, float], settings: LocalizeSettings) -> list[st
 def _support(numbers: Mapping[str, float], method: str) -> list[str]:
     if not numbers.get("num_matches"):
         return ["The pose comes from the references as a whole, not from matches."]
-    if method.rpartition("/")[2].startswith("feed_forward"):
+    if _is_by_network(method):
         return [f"{numbers['num_inliers']:.0f} of {numbers['num_matches']:.0f} references agree on the pose."]
     share, coverage = numbers.get("inlier_ratio", np.nan), numbers.get("coverage", np.nan)
     text = f"{numbers['num_inliers']:.0f} of {numbers['num_matches']:.0f} matches agree on the pose ({share:.0%})"

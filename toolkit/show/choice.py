@@ -2,25 +2,16 @@
 
 import difflib
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 
 from toolkit.errors import ArtifactError, ToolkitError
 from toolkit.files import image_name, own_name
 from toolkit.runs.kernel import TEXT_BARS
-
-T = TypeVar("T")
-T_co = TypeVar("T_co", covariant=True)
-
-
-class Queries(Protocol[T_co]):
-    names: Sequence[str]
-
-    def look(self, query: int | str = 0) -> T_co:
-        """Return a query by its number or name."""
 
 
 def shown_name(name: str, most: int = 1000) -> str:
@@ -59,13 +50,13 @@ def find_query(query: object, images: Mapping[str, int], count: int) -> int:
     raise ArtifactError(f"query: no query of the pair has an image {str(query)!r}. {hint}")
 
 
-class Choice(Generic[T]):
-    """The query that `choose` shows now (`shown`); None without queries."""
+@dataclass
+class Choice:
+    """The query that `choose` shows now; None without queries."""
 
-    def __init__(self, shown: T | None) -> None:
-        self.shown = shown
+    shown: Any
 
-    def attempt(self, ask: Callable[[T], Any]) -> None:
+    def attempt(self, ask: Callable[[Any], Any]) -> None:
         """Display `ask` of the shown query, or print its error, so that a notebook does not fail."""
         from IPython.display import display
 
@@ -76,12 +67,13 @@ class Choice(Generic[T]):
                 print(error)
 
 
-def choose(queries: Queries[T], chosen: int | str = 0) -> Choice[T]:
+def choose(queries: Any, chosen: int | str = 0) -> Choice:
     """Show a query, and a list to choose another in its place; return the choice.
 
     The picture is ordinary output, which a saved notebook keeps. There is no list when the pipeline runs the notebook.
 
     Args:
+        queries: `RetrievedPair`, `InspectedPair` or `WorstQueries`: has `names`, and `look`, which takes a number.
         chosen: number or name of the first query; ignored if it is a number and there are no queries.
 
     Raises:
@@ -92,7 +84,7 @@ def choose(queries: Queries[T], chosen: int | str = 0) -> Choice[T]:
     if not len(queries.names) and isinstance(chosen, int):
         print("There are no queries to show.")
         return Choice(None)
-    choice: Choice[T] = Choice(queries.look(chosen))
+    choice = Choice(queries.look(chosen))
     if TEXT_BARS in os.environ:
         display(choice.shown)
         return choice

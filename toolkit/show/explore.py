@@ -10,22 +10,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.devices import color_of
-from toolkit.capture.images import read_for_display
 from toolkit.capture.tables import POSE_NAMES, read_query_table
-from toolkit.capture.world_up import up_of_cameras
 from toolkit.embedders import embedding_folders, open_descriptors
 from toolkit.errors import CaptureError
 from toolkit.files import image_name, pair_devices, read_references
 from toolkit.geometry import Floats, qt_from_pose, unit
 from toolkit.localizers.odometry import Odometry, recordings_of
-from toolkit.show.figures import GREEN, ORANGE, VERMILLION, inches_to_pixels, new_figure, plain_log, styled
+from toolkit.show.figures import GREEN, ORANGE, VERMILLION, new_figure, plain_log, shared_legend, styled
 from toolkit.show.metrics import is_posed
-from toolkit.show.top_view import ground_axes, places_of
+from toolkit.show.query_images import draw_image
+from toolkit.show.top_view import Ground, Layer, draw_places
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-MAX_PLACES = 4
 
 
 def describe(capture: Capture, queries: str = "keyframes_pruned_subsampled") -> pd.DataFrame:
@@ -95,8 +92,7 @@ def draw_samples(capture: Capture, count: int = 4) -> "Figure":
     for line, name in zip(axes, names, strict=True):
         session = capture[name]
         for axis, row in zip(line, np.linspace(0, len(session) - 1, count).round().astype(int), strict=True):
-            axis.imshow(read_for_display(session.image_path(row), inches_to_pixels(2.4)), interpolation="antialiased")
-            axis.set(xticks=[], yticks=[])
+            draw_image(axis, session.image_path(row), 2.4)
         line[0].set_ylabel(name)
     return figure
 
@@ -115,22 +111,12 @@ def draw_top_view(capture: Capture, up: ArrayLike | None = None, unit: str | Non
     if not poses:
         return _empty("no session with poses can be used")
     everything = np.concatenate(list(poses.values()))
-    axes, labels = ground_axes(up_of_cameras(everything) if up is None else up, unit)
-    centers = everything[:, :3, 3] @ axes.T
-    sessions = np.repeat(list(poses), [len(of_session) for of_session in poses.values()])
-    place = places_of(centers)
-    count = min(place.max(initial=0) + 1, MAX_PLACES)
-    figure = new_figure(4.2 * count + 1, 4.6)
-    plots = figure.subplots(1, count, squeeze=False)[0]
-    for number, plot in enumerate(plots):
-        for name in poses:
-            x, y = centers[(place == number) & (sessions == name)].T
-            marker, size = ("o", 14) if capture[name].split == "map" else ("x", 36)
-            plot.scatter(x, y, s=size, c=color_of(capture[name].device), marker=marker, label=name, alpha=0.8)
-        plot.set_xlabel(labels[0])
-        plot.set_aspect("equal", adjustable="datalim")
-    plots[0].set_ylabel(labels[1])
-    plots[0].legend(fontsize=8)
+    layers = []
+    for name, of_session in poses.items():
+        style = {"s": 14} if capture[name].split == "map" else {"s": 36, "marker": "x"}
+        layers.append(Layer(of_session, name, color_of(capture[name].device), alpha=0.8, **style))
+    figure, _, panels = draw_places(Ground.below(everything, up, (unit, 1.0)), layers, everything)
+    shared_legend(figure, [axis for axis, _, _ in panels], ncols=6, frameon=False, fontsize=8)
     figure.suptitle("Cameras from above: maps (dots), queries where their pose is known (crosses)")
     return figure
 
@@ -207,8 +193,8 @@ def _draw_rows(
     figure = new_figure(2.2 * width, 1.9 * len(rows))
     axes = figure.subplots(len(rows), width, squeeze=False)
     for line, row in zip(axes, rows, strict=True):
-        for axis in line:
-            axis.set_axis_off()
+        for axis in line[1:]:
+            axis.set_axis_off()  # a query may have fewer references
         shown = [(line[0], row[0], f"query {query_device}")]
         for block, query in enumerate(row):
             for axis, hit in zip(line[1 + block * references :], query["topk"][:references], strict=False):
@@ -216,8 +202,7 @@ def _draw_rows(
                 score = f"{hit['score']} verified, was {hit['retrieval_rank']}" if verified else f"{hit['score']:.2f}"
                 shown.append((axis, hit, f"{map_device} {score}"))
         for axis, entry, title in shown:
-            axis.imshow(read_for_display(capture.image_path(image_name(entry["path"])), inches_to_pixels(2.2)))
-            axis.set_title(title, fontsize=8)
+            draw_image(axis, capture.image_path(image_name(entry["path"])), 2.2, title)
     return figure
 
 

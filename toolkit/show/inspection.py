@@ -3,7 +3,9 @@
 Nothing here localizes, except `Inspection.again`.
 """
 
-from collections.abc import Mapping, Sequence
+import json
+import textwrap
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,12 +20,13 @@ from toolkit.errors import OF_THE_DATA, ArtifactError
 from toolkit.files import SceneFiles, image_name, pair_devices, read_references, require_current
 from toolkit.geometry import Floats
 from toolkit.localizers.again import LocalizeAgain
+from toolkit.localizers.correspondences import LocalizedQuery
 from toolkit.localizers.map import RETRIEVAL, SESSIONS_ROOT, Map, how_localized, label
-from toolkit.manifest import nearest
-from toolkit.show.answers import NUMBERS, Answer, reason_in_words
+from toolkit.manifest import LocalizeSettings, nearest
+from toolkit.show.answers import LABELS, Answer
 from toolkit.show.choice import find_query, shown_name
 from toolkit.show.figures import shown
-from toolkit.show.inspection_view import draw_comparison, draw_inspection
+from toolkit.show.inspection_view import draw_answers
 from toolkit.show.localized import LocalizedPair
 from toolkit.show.metrics import is_posed, worst_first
 
@@ -58,7 +61,8 @@ class Inspection(Answer):
 
     @cached_property
     def figure(self) -> "Figure":
-        return draw_inspection(self)
+        title = f"{self.headline}\n{shown_name(self.name, 110)}\n{textwrap.fill(self.reason, 130)}"
+        return draw_answers([self], title)
 
     def _repr_mimebundle_(self, **_: Any) -> dict[str, bytes]:
         return shown(self.figure)
@@ -75,17 +79,16 @@ class Comparison:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """Status, method, numbers, errors and seconds; columns before and after; lengths in `pair.unit`."""
-        columns = {}
-        for name, one in (("before", self.before), ("after", self.after)):
-            error = dict(zip(("rotation_error_deg", "translation_error_m"), one.error or (), strict=False))
-            columns[name] = {"status": one.status, "method": one.method, **one.numbers, **error, "seconds": one.seconds}
-        return pd.DataFrame(columns, dtype=object)
+        """Status, method, numbers, errors and seconds as texts; columns before and after."""
+        both = {"before": self.before, "after": self.after}
+        return pd.DataFrame({name: {"status": one.status, **one.texts} for name, one in both.items()}, dtype=object)
 
     @cached_property
     def figure(self) -> "Figure":
         """Both answers side by side."""
-        return draw_comparison(self.before, self.after, self.changes)
+        changed = json.dumps(self.changes)[1:-1] if self.changes else "no setting changed"
+        first = self.before.headline.rpartition(":")[0]
+        return draw_answers([self.before, self.after], f"{first}, localized again\n{textwrap.fill(changed, 120)}")
 
     def __repr__(self) -> str:
         return f"{self.changes or 'nothing changed'}\nbefore: {self.before!r}\nafter: {self.after!r}"
@@ -143,72 +146,51 @@ class InspectedPair:
     def label(self) -> str:
         return f"{self.query_device} in the map of {self.map_device}"
 
-    @cached_property
-    def true(self) -> Floats:
-        """True world_from_rig (Q, 4, 4); NaN where unknown."""
-        truth, table = self.localized.query_session.ground_truth, self.localized.table
-        if truth is None:
-            return np.full((len(self), 4, 4), np.nan)
-        return truth.lookup(table["timestamp"].to_numpy(), table["device_id"])
-
-    def _true(self, number: int) -> Floats | None:
-        return self.true[number] if is_posed(self.true[number]) else None
-
-    @cached_property
-    def table(self) -> pd.DataFrame:
-        """The pair's csv with `rotation_error_deg` and `translation_error_m`, see `Localizations.ranked`."""
-        return self.localized.localizations.ranked
-
-    def worst_first(self) -> list[int]:
-        """Return the numbers of the queries from worst to best, see `metrics.worst_first`."""
-        return self.localized.localizations.worst_first().tolist()
-
-    def number_of(self, query: int | str) -> int:
-        """Return the number of a query.
+    def look(self, query: int | str = 0) -> Inspection:
+        """Return a query with the stored results of the localize stage.
 
         Args:
             query: its number, the name of one of its images (or a unique end of the name), or `worst`.
 
         Raises:
-            ArtifactError: no query matches, or several do; names the nearest.
+            ArtifactError: no query matches, or several do (the nearest is named), or its stored results are damaged.
         """
         if query == WORST and len(self):
-            return self.worst_first()[0]
+            query = int(self.localized.localizations.worst_first()[0])
         names = self.localized.query_session.image_names
         images = {names[row]: number for number, rows in enumerate(self.localized.rows) for row in rows}
-        return find_query(query, images, len(self))
-
-    def look(self, query: int | str = 0) -> Inspection:
-        """Return a query with the stored results of the localize stage.
-
-        Args:
-            query: see `number_of`.
-
-        Raises:
-            ArtifactError: the query does not exist, or its stored results are damaged.
-        """
-        number = self.number_of(query)
-        row = self.localized.table.iloc[number]
-        pose = self.localized.world_from_rig[number]
-        numbers = self._numbers({name: row[name] for name in NUMBERS if name in row})
-        status, stated = str(row["status"]), str(row["reason"]) if pd.notna(row.get("reason")) else ""
-        method = str(row["method"])
-        return Inspection(
-            self.localized, number, status, method, reason_in_words(status, stated, numbers, self.settings, method),
-            numbers, self.localized.localized(number), pose if is_posed(pose) else None, self._covariance(number),
-            self.settings, float(row.get("seconds", np.nan)), self._true(number), self._retrieved(number), of=self,
+        number = find_query(query, images, len(self))
+        row, pose = self.localized.table.iloc[number], self.localized.world_from_rig[number]
+        stated = str(row["reason"]) if pd.notna(row.get("reason")) else ""
+        covariance = self._covariances.get((int(row["timestamp"]), str(row["device_id"])))
+        return self._inspection(
+            number, row, str(row["status"]), stated, str(row["method"]), self.localized.localized(number),
+            pose if is_posed(pose) else None, covariance, self.settings, float(row.get("seconds", np.nan)),
         )  # fmt: skip
 
     def localize(self, number: int, changes: Mapping[str, Any]) -> Inspection:
         """Localize a query again; see `Inspection.again`."""
         settings = self._again.settings(changes)
         estimate, localized, seconds = self._again.localize(self.localized.rows[number], settings)
+        values = {name: getattr(estimate, name) for name in LABELS}
         method = label(settings, "" if estimate.world_from_rig is None else estimate.found_by)
-        numbers = self._numbers({name: getattr(estimate, name) for name in NUMBERS})
+        return self._inspection(
+            number, values, estimate.status, estimate.reason, method, localized, estimate.world_from_rig,
+            estimate.covariance, settings, seconds,
+        )  # fmt: skip
+
+    def _inspection(
+        self, number: int, values: Mapping[str, Any], status: str, stated: str, method: str, localized: LocalizedQuery,
+        pose: Floats | None, covariance: Floats | None, settings: LocalizeSettings, seconds: float,
+    ) -> Inspection:  # fmt: skip
+        """Add to a result what is known about the query: unit of lengths, retrieval."""
+        numbers = {name: float(values[name]) for name in LABELS if name in values and np.isfinite(values[name])}
+        if "position_std_m" in numbers:
+            numbers["position_std_m"] /= self.localized.unit[1]
+        if covariance is not None and not np.isfinite(covariance).all():
+            covariance = None
         return Inspection(
-            self.localized, number, estimate.status, method,
-            reason_in_words(estimate.status, estimate.reason, numbers, settings, method), numbers, localized,
-            estimate.world_from_rig, _if_finite(estimate.covariance), settings, seconds, self._true(number),
+            self.localized, number, status, stated, method, numbers, localized, pose, covariance, settings, seconds,
             self._retrieved(number), of=self,
         )  # fmt: skip
 
@@ -224,15 +206,6 @@ class InspectedPair:
         poses = Trajectory.read(self._h5.with_suffix(".txt"))
         keys = zip(poses.timestamps.tolist(), map(str, poses.device_ids), strict=True)
         return {} if poses.covariances is None else dict(zip(keys, poses.covariances, strict=True))
-
-    def _covariance(self, number: int) -> Floats | None:
-        row = self.localized.table.iloc[number]
-        return _if_finite(self._covariances.get((int(row["timestamp"]), str(row["device_id"]))))
-
-    def _numbers(self, values: Mapping[str, Any]) -> dict[str, float]:
-        """Return the known values of `NUMBERS`, lengths converted to the unit that they are shown in."""
-        lengths = {"position_std_m": self.localized.unit[1]}
-        return {name: float(value) / lengths.get(name, 1.0) for name, value in values.items() if np.isfinite(value)}
 
     @cached_property
     def _topk(self) -> dict[tuple[int, str], list[dict[str, Any]]]:
@@ -253,45 +226,34 @@ class InspectedPair:
         return dict(sorted(best.items(), key=lambda item: item[1][0]))
 
 
-def _if_finite(covariance: Floats | None) -> Floats | None:
-    return covariance if covariance is not None and np.isfinite(covariance).all() else None
-
-
 class WorstQueries:
     """The queries of several pairs, the worst first, to inspect one at a time."""
 
-    def __init__(self, pairs: Sequence[InspectedPair]) -> None:
-        self._pairs = list(pairs)
-        tables = [pair.table.assign(pair=k, number=range(len(pair))) for k, pair in enumerate(self._pairs)]
-        empty = pd.DataFrame({"status": [], "pair": [], "number": []})
-        table = pd.concat(tables, ignore_index=True) if tables else empty
-        self.table = table.iloc[worst_first(table)].reset_index(drop=True) if len(table) else table
-        """One row per query: the columns of `InspectedPair.table`, pair and number."""
-        queries = zip(self.table["pair"], self.table["number"], strict=True)
-        self.names = [f"{self._pairs[k].label}: {shown_name(self._pairs[k].names[number])}" for k, number in queries]
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         poses_dir: str | Path,
         map_dir: str | Path | None = None,
         sessions_root: str | Path | None = None,
         map_device: str = "all",
         query_device: str = "all",
-    ) -> "WorstQueries":
-        """Return the queries of all pairs in a folder of poses that have stored correspondences and can be read.
+    ) -> None:
+        """Take the queries of all pairs in a folder of poses that have stored correspondences and can be read.
 
         Args:
             poses_dir, map_dir, sessions_root: as for `InspectedPair`.
             map_device, query_device: devices of the pairs, or `all`.
         """
-        pairs = []
+        pairs: list[InspectedPair] = []
         for path in sorted(Path(poses_dir).glob("*_map_*_query_*.h5")):
             mapped, queried = pair_devices(path.stem)
             if map_device in ("all", mapped) and query_device in ("all", queried):
                 with suppress(*OF_THE_DATA):  # an unfinished pair has no table, or a session broke after a good run
                     pairs.append(InspectedPair(mapped, queried, poses_dir, None, map_dir, sessions_root))
-        return cls(pairs)
+        queries = [(pair, number) for pair in pairs for number in range(len(pair))]
+        tables = [pair.localized.localizations.ranked for pair in pairs]
+        order = worst_first(pd.concat(tables, ignore_index=True)).tolist() if queries else []
+        self._queries = [queries[k] for k in order]
+        self.names = [f"{pair.label}: {shown_name(pair.names[number])}" for pair, number in self._queries]
 
     def look(self, rank: int | str = 0) -> Inspection:
         """Return a query by its rank, 0 for the worst of all.
@@ -301,8 +263,8 @@ class WorstQueries:
         """
         if not isinstance(rank, int | np.integer) or not 0 <= rank < len(self.names):
             raise ArtifactError(f"query: found {rank!r}, expected a rank from 0, the worst, to {len(self.names) - 1}.")
-        row = self.table.iloc[int(rank)]
-        return self._pairs[int(row["pair"])].look(int(row["number"]))
+        pair, number = self._queries[int(rank)]
+        return pair.look(number)
 
 
 def inspect_query(

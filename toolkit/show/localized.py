@@ -92,6 +92,8 @@ class ShownImage:
     """(n,) whether each correspondence agrees with the pose."""
     world_from_cam_true: Floats = field(default_factory=lambda: np.full((4, 4), np.nan))
     """(4, 4); NaN if unknown."""
+    found_by: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, np.str_))
+    """(n,) how each correspondence was found, such as `sift/guided`."""
 
     @property
     def num_inliers(self) -> int:
@@ -107,7 +109,7 @@ class ShownImage:
         )
 
 
-_OF_A_MATCH = ("pixels", "points", "matches", "inlier")
+_OF_A_MATCH = ("pixels", "points", "matches", "inlier", "found_by")
 
 
 @dataclass(frozen=True)
@@ -313,4 +315,5 @@ def _shown_image(
         matches,
         correspondences.inlier[matches],
         session.world_from_cam([row], ground_truth=True)[0],
+        correspondences.found_by[matches],
     )

@@ -11,30 +11,17 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from toolkit.capture import Capture, Session
-from toolkit.capture.images import read_for_display
-from toolkit.capture.world_up import up_of_cameras
 from toolkit.embedders import open_descriptors
 from toolkit.errors import ArtifactError
 from toolkit.files import image_name, pair_devices, read_references, require_current
 from toolkit.geometry import Floats, Ints
 from toolkit.show.choice import find_query, shown_name
-from toolkit.show.figures import (
-    BLUE,
-    GRAY,
-    GREEN,
-    MAP,
-    ORANGE,
-    TRUE,
-    inches_to_pixels,
-    new_figure,
-    shared_legend,
-    shown,
-    styled,
-)
+from toolkit.show.figures import BLUE, GRAY, GREEN, MAP, ORANGE, TRUE, new_figure, shared_legend, shown, styled
 from toolkit.show.localized import load_maps, map_files
 from toolkit.show.metrics import is_posed
 from toolkit.show.overlap import LEAST_OVERLAP, overlap_in_view, seen_by
-from toolkit.show.top_view import draw_dots, ground_axes
+from toolkit.show.query_images import draw_image, query_and_references
+from toolkit.show.top_view import Ground, Layer, draw_layers, window_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,8 +29,8 @@ if TYPE_CHECKING:
 
 MOST = 2000
 """Map images that a query is compared with besides its references, at most: a regular sample."""
-IN_STRIP = 10
-"""References in the strip per row, at most."""
+IN_ROW = 5
+"""References per row, at most."""
 
 
 @dataclass(frozen=True)
@@ -201,20 +188,20 @@ def draw_retrieved(query: RetrievedQuery) -> "Figure":
 
     With a true pose, images that overlap with the query are green, and references that do not are orange.
     """
-    count = len(query.references)
-    columns = min(IN_STRIP, max(count, 4)) // (2 if count > 5 else 1) + (count > 5 and min(IN_STRIP, count) % 2)
-    rows = max(1, -(-count // columns))
+    count, session, map_session = len(query.references), query.session, query.map_session
+    rows = max(1, -(-count // IN_ROW))
     figure = new_figure(11, 1.75 * rows + 4.6)
     strip, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[1.75 * rows + 0.3, 4.3])[:, 0]
-    grid = strip.add_gridspec(rows, columns + rows)
-    _draw_image(strip.add_subplot(grid[:, :rows]), query.session.image_path(query.row), "query", "black", 2.4 * rows)
-    for k, hit in enumerate(query.references.itertuples()):
-        panel = strip.add_subplot(grid[k // columns, rows + k % columns])
+    rows_of_map = [map_session.row_of_name.get(name) for name in query.references["name"]]
+    ratios = [_ratio(map_session, row) for row in rows_of_map if row is not None]
+    axis, panels = query_and_references(strip, count, rows, _ratio(session, query.row), max(ratios, default=1.0))
+    draw_image(axis, session.image_path(query.row), 2.4 * rows, "query", frame="black")
+    for panel, hit, row in zip(panels, query.references.itertuples(), rows_of_map, strict=True):
         known, good = np.isfinite(hit.overlap), hit.overlap >= LEAST_OVERLAP
         text = f"{hit.rank}: {hit.score:.2f}" + (f", overlap {hit.overlap:.0%}" if known else "")
         color = (GREEN if good else ORANGE) if known else GRAY
-        row = query.map_session.row_of_name.get(hit.name)
-        _draw_image(panel, None if row is None else query.map_session.image_path(row), text, color, 2.4)
+        image = np.full((3, 4), 230, np.uint8) if row is None else map_session.image_path(row)
+        draw_image(panel, image, 2.4, text if row is not None else f"{text}, not in the capture", color, color)
     along, above = below.subplots(1, 2, width_ratios=[1.6, 1.0])
     _draw_along(along, query)
     _draw_from_above(above, query)
@@ -227,15 +214,10 @@ def draw_retrieved(query: RetrievedQuery) -> "Figure":
     return figure
 
 
-def _draw_image(axis: "Axes", path: Path | None, title: str, color: str, width: float) -> None:
-    """Draw an image that is at most `width` inches wide."""
-    axis.set(xticks=[], yticks=[])
-    if path is not None:
-        axis.imshow(read_for_display(path, inches_to_pixels(width)), interpolation="antialiased")
-    else:
-        axis.text(0.5, 0.5, "not in the capture", ha="center", transform=axis.transAxes, fontsize=8)
-    axis.set_title(title, fontsize=8, color=color)
-    axis.spines[:].set(color=color, linewidth=2.5, visible=True)
+def _ratio(session: Session, row: int) -> float:
+    """Return width by height of an image."""
+    camera = session.camera(str(session.images["sensor_id"].iloc[row]))
+    return float(camera.width / camera.height)
 
 
 def _overlap_and_retrieved(query: RetrievedQuery) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -269,27 +251,20 @@ def _draw_along(axis: "Axes", query: RetrievedQuery) -> None:
 
 def _draw_from_above(axis: "Axes", query: RetrievedQuery) -> None:
     """Draw the positions of the map images, the references and, if known, the query."""
-    poses = query.map_session.world_from_cam(query.images)
-    axes, labels = ground_axes(up_of_cameras(poses))
-    places = poses[:, :3, 3] @ axes.T
+    poses, true = query.map_session.world_from_cam(query.images), query.session.world_from_cam([query.row], True)
     good, retrieved = _overlap_and_retrieved(query)
+    layers = [
+        Layer(poses[~good], None, "0.6" if query.is_known else MAP, s=9, lw=0),
+        Layer(poses[good], None, GREEN, s=16, lw=0),
+        Layer(poses[retrieved], None, BLUE, hollow=True, s=55, lw=1.2),
+        Layer(true, "the query, true", TRUE, 0.06, s=60, marker="*", zorder=5),
+    ]
     # Zoom to the relevant images, as a map may have several places.
-    in_window = places[good | retrieved] if (good | retrieved).any() else places
-    draw_dots(axis, places[~good], s=9, c="0.6" if query.is_known else MAP, lw=0)
-    draw_dots(axis, places[good], s=16, c=GREEN, lw=0)
-    draw_dots(axis, places[retrieved], s=55, facecolors="none", edgecolors=BLUE, lw=1.2)
-    true = query.session.world_from_cam([query.row], ground_truth=True)
-    if is_posed(true)[0]:
-        at = (true[:, :3, 3] @ axes.T)[0]
-        in_window = np.vstack([in_window, at])
-        extent = max(float(np.ptp(in_window, axis=0).max()), 1.0)
-        x, y = np.stack([at, at + 0.07 * extent * axes @ true[0, :3, 2]]).T
-        axis.plot(x, y, color=TRUE, lw=1.4)
-        axis.scatter([at[0]], [at[1]], s=60, marker="*", c=TRUE, zorder=5, label="the query, true")
-    low, high = in_window.min(0), in_window.max(0)
-    middle, half = (low + high) / 2, 0.7 * max(float((high - low).max()), 1.0)
-    outside = int((np.abs(places - middle) > half).any(1).sum())
-    axis.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
-    axis.set(xlabel=labels[0], ylabel=labels[1])
+    relevant = poses[good | retrieved] if (good | retrieved).any() else poses
+    ground = Ground.below(poses)
+    window = window_of(ground.flat(np.concatenate([relevant, true[is_posed(true)]])), margin=0.2)
+    draw_layers(axis, ground, layers, window)
+    places = ground.flat(poses)
+    outside = int(((places < window[0]) | (places > window[1])).any(axis=1).sum())
     elsewhere = f"; {outside} map images are elsewhere" if outside else ""
     axis.set_title(f"cameras from above{elsewhere}", fontsize=9)

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.tables import POSE_NAMES, as_strings, read_query_table
-from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import ArtifactError
 from toolkit.files import pair_name, require_current, require_whole
 from toolkit.geometry import Floats
@@ -30,14 +29,13 @@ from toolkit.show.metrics import (
     threshold_name,
     unit_of,
 )
-from toolkit.show.top_view import ground_axes, places_of
+from toolkit.show.top_view import Ground, Layer, draw_places
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 log = logging.getLogger(__name__)
 
-MAX_PLACES = 4
 SINGLE, SEQUENCE = "single", "sequence"
 """Names of the first and the last step."""
 CHANGES = ("rescued", "broken")
@@ -177,53 +175,29 @@ def draw_sequence(
         up: up direction (3,); None: estimated from the map's cameras.
         unit: unit that lengths are shown in, see `metrics.length_unit`.
     """
-    map_poses = capture[f"{map_device}_map"].world_from_cam()
-    map_poses, session = map_poses[is_posed(map_poses)], capture[f"{query_device}_query"]
-    axes, labels = ground_axes(up_of_cameras(map_poses) if up is None else up, unit[0])
-    flat = axes.T / unit[1]
+    map_poses, session = capture[f"{map_device}_map"].world_from_cam(), capture[f"{query_device}_query"]
+    map_poses, before, after = map_poses[is_posed(map_poses)], pair.odometry_tracks(session), pair.tracks()
     single, table = pair.steps[SINGLE], pair.frames
-    before, after = ([track @ flat for track in tracks] for tracks in (pair.odometry_tracks(session), pair.tracks()))
-    centers, queries = map_poses[:, :3, 3] @ flat, single.world_from_device[:, :3, 3] @ flat
     # A query that was localized again may be used with another pose than the drawn single pose.
     agreeing = table[(table["used"].astype(str) == "True") & table["again_status"].isna()]
     agrees = pd.MultiIndex.from_arrays([single.timestamps, single.device_ids]).isin(agreeing.set_index(_KEY).index)
-    marks = _marks(pair, session, unit[1])
+    queries, marks = single.world_from_device, _marks(pair, session, unit[1])
+    sky: dict[str, Any] = {"marker": ".", "markersize": 4, "lw": 1.2}
+    layers = [
+        Layer(map_poses, f"map, {map_device}", "0.78", s=12),
+        *(Layer(track, "odometry, rigidly placed", ORANGE, track=True, ls="--", lw=1.2) for track in before),
+        *(Layer(track, "frames of the sequence", SKY, track=True, **sky) for track in after),
+        Layer(queries[agrees], "single queries that agree", GREEN, s=34, marker="x", zorder=3),
+        Layer(queries[~agrees], "single queries that are in doubt", VERMILLION, s=34, marker="x", zorder=3),
+        *(
+            Layer(marks[name], f"{name}: {len(marks[name])}", "black", hollow=True, s=70, marker=marker, lw=1, zorder=4)
+            for name, marker in (("rescued", "^"), ("broken", "v"))
+        ),
+    ]
     # The map and the tracks define the panels; single poses far off are not drawn.
-    place = places_of(np.concatenate([centers, *after]))
-    count = min(place.max(initial=0) + 1, MAX_PLACES)
-    figure = new_figure(5.2 * count + 1, 5)
-    plots = figure.subplots(1, count, squeeze=False)[0]
-    shown = np.concatenate([centers, *after])
-    for number, plot in enumerate(plots):
-        in_panel = shown[place == number]
-        plot.scatter(*centers[place[: len(centers)] == number].T, s=12, c="0.78", label=f"map, {map_device}")
-        low, high = (in_panel.min(axis=0), in_panel.max(axis=0)) if len(in_panel) else (np.zeros(2), np.ones(2))
-        low, high = low - 3 / unit[1], high + 3 / unit[1]
-
-        def inside(points: Floats, low: Floats = low, high: Floats = high) -> NDArray[np.bool_]:
-            return np.asarray(((points > low) & (points < high)).all(axis=1))
-
-        for tracks, style, name in (
-            (before, {"color": ORANGE, "linestyle": "--", "linewidth": 1.2}, "odometry, rigidly placed"),
-            (after, {"color": SKY, "marker": ".", "markersize": 4, "linewidth": 1.2}, "frames of the sequence"),
-        ):
-            for track in tracks:
-                kept = np.where(inside(track)[:, None], track, np.nan)
-                if np.isfinite(kept).any():
-                    plot.plot(*kept.T, label=name, **style)
-        for chosen, color, name in ((agrees, GREEN, "agree"), (~agrees, VERMILLION, "are in doubt")):
-            drawn = inside(queries) & chosen
-            if drawn.any():
-                plot.scatter(*queries[drawn].T, s=34, marker="x", c=color, label=f"single queries that {name}")
-        for name, marker in (("rescued", "^"), ("broken", "v")):
-            points = marks[name] @ flat
-            if len(points := points[inside(points)]):
-                style = {"facecolors": "none", "edgecolors": "black", "linewidths": 1}
-                plot.scatter(*points.T, s=70, marker=marker, label=f"{name}: {len(marks[name])}", **style)
-        plot.set_xlabel(labels[0])
-        plot.set_aspect("equal", adjustable="datalim")
-    plots[0].set_ylabel(labels[1])
-    shared_legend(figure, plots, ncols=4, fontsize=8)
+    defining = np.concatenate([map_poses[:, :3, 3], *after])
+    figure, _, panels = draw_places(Ground.below(map_poses, up, unit), layers, defining)
+    shared_legend(figure, [axis for axis, _, _ in panels], ncols=4, fontsize=8)
     figure.suptitle(f"{query_device} recordings in the {map_device} map, from above")
     return figure
 

@@ -1,19 +1,16 @@
 """Draw a network's prediction for one query: references, aligned cameras and depth."""
 
 import textwrap
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from toolkit.capture.images import read_for_display
-from toolkit.capture.world_up import up_of_cameras
-from toolkit.geometry import Floats
 from toolkit.localizers.base import Query, View
 from toolkit.localizers.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer
-from toolkit.show.figures import BLUE, GRAY, GREEN, VERMILLION, inches_to_pixels, new_figure, styled
-from toolkit.show.top_view import ground_axes
+from toolkit.show.figures import BLUE, GRAY, GREEN, VERMILLION, new_figure, styled
+from toolkit.show.query_images import draw_image
+from toolkit.show.top_view import Ground, Layer, draw_layers, window_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,11 +68,7 @@ def _draw_view(
     photograph: "Axes", depth: "Axes", view: View, number: int, result: CameraAnswer, label: str, color: str
 ) -> None:
     photograph.set_axis_on()
-    photograph.set(xticks=[], yticks=[])
-    image = read_for_display(view.image, inches_to_pixels(3)) if isinstance(view.image, Path) else view.image
-    photograph.imshow(image, cmap="gray")
-    photograph.set_title(label, fontsize=8, color=color)
-    photograph.spines[:].set(color=color, linewidth=2.5, visible=True)
+    draw_image(photograph, view.image, 3, label, color, frame=color)
     prediction = result.prediction
     if prediction is None or prediction.depth is None:
         return
@@ -99,45 +92,23 @@ def _draw_from_above(
     axis: "Axes", localizer: FeedForwardLocalizer, result: CameraAnswer, kept: NDArray[np.bool_], up: ArrayLike | None
 ) -> None:
     local_map, alignment = localizer.map, result.alignment
-    axes, labels = ground_axes(up_of_cameras(local_map.world_from_cams) if up is None else up)
-    references = local_map.world_from_cams[result.references]
-    drawn = [references]
+    ground, references = Ground.below(local_map.world_from_cams, up), local_map.world_from_cams[result.references]
+    layers, drawn = [Layer(local_map.points, None, "0.73", s=1, lw=0, rasterized=True)], [references]
+    layers.append(Layer(local_map.world_from_cams, "map", GRAY, 0.02, s=5))
+    layers.append(Layer(references, "reference in the map", BLUE, 0.05, hollow=True, s=60, marker="s"))
     if alignment is not None and result.prediction is not None and np.isfinite(alignment.rotation_std_deg):
-        finite = np.isfinite(result.prediction.model_from_cams[1:]).all(axis=(1, 2))
         aligned = alignment.world_from_model.apply_to_pose(result.prediction.model_from_cams[1:])
         drawn.append(aligned[kept])
-        for agreed, color, label in ((True, GREEN, "consistent"), (False, VERMILLION, "left out")):
-            shown = (kept == agreed) & finite
-            _draw_cameras(axis, aligned[shown], axes, color, f"predicted, {label}", "o")
-            for start, end in zip(references[shown, :3, 3] @ axes.T, aligned[shown, :3, 3] @ axes.T, strict=True):
-                axis.plot(*zip(start, end, strict=True), c=color, lw=0.8)
+        for agrees, color, label in ((True, GREEN, "consistent"), (False, VERMILLION, "left out")):
+            layers.append(Layer(aligned[kept == agrees], f"predicted, {label}", color, 0.05, s=28, zorder=3))
+            joined = np.stack([references, aligned], axis=1)[kept == agrees, :, :3, 3]
+            layers += [Layer(ends, None, color, track=True, lw=0.8) for ends in joined]
     if result.world_from_cam is not None:
         drawn.append(result.world_from_cam[None])
-        _draw_cameras(axis, result.world_from_cam[None], axes, "black", "query", "*")
-    _draw_cameras(axis, references, axes, BLUE, "reference in the map", "s")
-    _draw_cameras(axis, local_map.world_from_cams, axes, GRAY, "map", ".")
-    centers = np.concatenate(drawn)[:, :3, 3] @ axes.T
-    if not len(centers):
-        centers = local_map.world_from_cams[:, :3, 3] @ axes.T
+        layers.append(Layer(result.world_from_cam[None], "query", "black", 0.08, s=90, marker="*", zorder=4))
     # The window ignores cameras that were left out: they may be far away.
-    middle, half = (centers.min(axis=0) + centers.max(axis=0)) / 2, np.ptp(centers, axis=0).max() * 0.75 + 1.0
-    cloud = local_map.points @ axes.T
-    near = (np.abs(cloud - middle) < half).all(axis=1)
-    axis.scatter(cloud[near, 0], cloud[near, 1], s=1, c="#BBBBBB", lw=0, zorder=0, rasterized=True)
-    axis.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
-    axis.set(xlabel=labels[0], ylabel=labels[1])
+    centers = ground.flat(np.concatenate(drawn) if sum(map(len, drawn)) else local_map.world_from_cams)
+    draw_layers(axis, ground, layers, window_of(centers, margin=0.5))
     axis.set_title("cameras from above; lines join true and predicted references", fontsize=9)
     axis.grid(alpha=0.2)
     axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3, frameon=False)
-
-
-def _draw_cameras(axis: "Axes", poses: Floats, axes: Floats, color: str, label: str, marker: str) -> None:
-    """Draw cameras (N, 4, 4) from above, with their viewing directions."""
-    if not len(poses):
-        return
-    centers, looks = poses[:, :3, 3] @ axes.T, poses[:, :3, 2] @ axes.T
-    size, layer = (14, 1) if marker == "." else (90 if marker == "*" else 60 if marker == "s" else 28, 3)
-    face = "none" if marker == "s" else color  # a hollow square does not hide a marker below
-    x, y = centers.T
-    axis.scatter(x, y, s=size, facecolors=face, edgecolors=color, marker=marker, label=label, zorder=layer)
-    axis.quiver(x, y, *looks.T, color=color, width=0.003, scale=18, headwidth=3, zorder=layer)
