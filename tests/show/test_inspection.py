@@ -82,6 +82,7 @@ def test_it_shows_what_the_stage_stored(files: SceneFiles, pair: InspectedPair) 
     assert one.numbers["num_inliers"] == row["num_inliers"]
     assert one.matches["agree"].sum() == stored.correspondences.inlier.sum() > 0
     assert one.matches.to_numpy().sum() == len(stored.correspondences)
+    assert one.error[1] == pytest.approx(np.linalg.norm((invert(one.pose) @ one.true_pose)[:3, 3])), "of the rig"
     assert one.references["name"][one.references["used"]].tolist() == stored.references
     ranked = one.references.dropna(subset="rank")
     assert ranked["rank"].min() == 1
@@ -91,9 +92,8 @@ def test_it_shows_what_the_stage_stored(files: SceneFiles, pair: InspectedPair) 
         assert counts["agree"] == 0 or f"{str(kind).replace('/', ', ')}: {counts['agree']} agree" in shown
     assert one.status in shown
     assert f"\n{one.name.partition('/raw_data/')[2]}\n" in shown
-    assert "true position error [m]\n0\n" not in shown
-    assert "0.000\n" not in shown
     assert f"{row['num_inliers']}" in shown
+    assert one.texts["true position error [m]"].strip("0.")
     assert picture_of(one).width > 800
 
 
@@ -156,10 +156,10 @@ def test_a_failed_query_says_why_and_is_drawn(small_capture: Path, tmp_path: Pat
     one = pair.look(0)
     assert one.pose is None
     assert one.error is None
-    assert one.reason == "No pose: too few inliers (4 within 0.45 deg) among 9 matches; at least 12 are required."
+    assert all(count in one.reason for count in ("4 within 0.45 deg", "9 matches", "at least 12"))
     assert "no pose" in text_of(one.figure)
     assert picture_of(one).width > 800
-    assert pair.look(1).reason == "No pose: the retrieval has no references for this query."
+    assert "no references" in pair.look(1).reason
 
 
 def test_rivals_are_drawn_where_they_are(small_capture: Path, tmp_path: Path) -> None:
@@ -222,7 +222,7 @@ def test_what_is_not_known_is_not_shown(files: SceneFiles, small_capture: Path, 
     assert "true" not in text_of(one.figure)
 
 
-def test_names_and_numbers_that_are_none_are_refused(files: SceneFiles, pair: InspectedPair) -> None:
+def test_names_and_numbers_that_are_none_are_refused(files: SceneFiles, pair: InspectedPair, tmp_path: Path) -> None:
     name = pair.localized.query_session.image_name(int(pair.localized.rows[2][-1]))
     for same in (name, name.partition("raw_data/")[2], f"SMALL/sessions/{name}"):
         assert pair.look(same).number == 2
@@ -236,29 +236,18 @@ def test_names_and_numbers_that_are_none_are_refused(files: SceneFiles, pair: In
         find_query("b.jpg", {"x/b.jpg": 0, "y/b.jpg": 1, "y/ab.jpg": 2}, 3)
     with pytest.raises(ArtifactError, match=r"no correspondences of queries of 'spt'.*Did you mean .*spot"):
         inspect_query(files.run, files.scene, "ios", "spt", 0)
+    with pytest.raises(ArtifactError, match="no correspondences"):
+        InspectedPair("ios", "spot", tmp_path)
     with pytest.raises(ArtifactError, match=r"no poses of the scene 'SMAL'.*Known: SMALL"):
         inspect_query(files.run, "SMAL", "ios", "spot", 0)
-
-
-def test_a_run_without_correspondences_says_so(files: SceneFiles, tmp_path: Path) -> None:
-    poses = tmp_path / "run" / files.scene / "poses"
-    shutil.copytree(files.poses_dir, poses)
-    for stored in poses.glob("*.h5*"):
-        stored.unlink()
-    with pytest.raises(ArtifactError, match=r"no correspondences of queries of 'spot' in the map of 'ios'.*Localize"):
-        inspect_query(tmp_path / "run", files.scene, "ios", "spot", 0)
 
 
 def test_an_estimate_in_doubt_says_why() -> None:
     numbers = {"num_inliers": 20, "num_matches": 80, "inlier_ratio": 0.25, "coverage": 0.2, "p_correct": 0.7}
     words = reason_in_words("low_confidence", "", numbers | {"rival_support": 0.93}, LocalizeSettings())
-    assert "probability of 70%; ok requires 99%" in words
-    assert "Another pose has 93% of its support, so it may be the right one." in words
-    nearest = reason_in_words("low_confidence", "", {}, LocalizeSettings.of({"method": "nearest"}))
-    assert nearest == "This is the unchanged pose of the best reference, which is never called ok."
-    fits = "the focal length that fits is 500 px"
-    camera = reason_in_words("low_confidence: camera?", fits, numbers, LocalizeSettings())
-    assert camera.endswith("The focal length that fits is 500 px.")
+    assert all(share in words for share in ("70%", "99%", "93%")), "its probability, the limit, and the rival"
+    camera = reason_in_words("low_confidence: camera?", "the focal length is 500 px", numbers, LocalizeSettings())
+    assert camera.endswith("The focal length is 500 px.")
 
 
 def test_a_list_chooses_what_is_shown(pair: InspectedPair, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -299,10 +288,3 @@ def test_asking_in_a_notebook_does_not_end_it(
     Choice(pair.look(0)).attempt(lambda query: query.again({"features": {"max_keypoints": 5}}))
     assert "features" in capsys.readouterr().out
     Choice(None).attempt(lambda query: pytest.fail("there is none"))
-
-
-def test_the_error_is_that_of_the_rig(pair: InspectedPair) -> None:
-    one = pair.look(0)
-    assert one.true_pose is not None
-    between = invert(one.pose) @ one.true_pose
-    assert one.error[1] == pytest.approx(np.linalg.norm(between[:3, 3]))

@@ -51,8 +51,9 @@ def drawn(axis):
     return [np.asarray(xy) for xy in dots]
 
 
-def test_a_single_camera_shows_its_inliers_and_where_its_references_see_them(capture, open_pair):
-    found = some_correspondences([0] * 6, INLIERS)
+@pytest.mark.parametrize("point_index", [None, -1])  # -1: lifted points, which no map holds
+def test_a_single_camera_shows_its_inliers_and_where_its_references_see_them(capture, open_pair, point_index):
+    found = some_correspondences([0] * 6, INLIERS, point_index=point_index)
     query = LocalizedQuery(query_images(capture, "ios"), names(capture["ios_map"], 2), [], found)
     details = open_pair("ios", query).details(0)
     (camera,) = details.cameras
@@ -100,14 +101,6 @@ def test_errors_are_those_of_the_device_as_in_the_evaluation(capture, open_pair)
     assert np.linalg.norm((shown.estimated - shown.true)[0, :3, 3]) > 0.01, "the camera stands beside the rig's center"
 
 
-def test_lifted_points_are_shown_although_no_map_holds_them(capture, open_pair):
-    found = some_correspondences([0] * 6, INLIERS, point_index=-1)
-    query = LocalizedQuery(query_images(capture, "ios"), names(capture["ios_map"], 2), [], found)
-    details = open_pair("ios", query, method="hybrid").details(0)
-    np.testing.assert_allclose(details.cameras[0].points, found.points)
-    assert [image.num_inliers for image in details.references] == [4, 2]
-
-
 def test_a_network_shows_consistent_and_rejected_references_and_claims_no_matches(capture, open_pair):
     images = names(capture["ios_map"], 4)
     query = LocalizedQuery(query_images(capture, "ios"), images[:2], images[2:])
@@ -119,14 +112,6 @@ def test_a_network_shows_consistent_and_rejected_references_and_claims_no_matche
     captions = [axis.get_title() for axis in figure.axes[1:]]
     assert captions == ["reference 1", "reference 2", *["rejected: contradicts the others"] * 2]
     assert not any(len(xy) for axis in figure.axes for xy in drawn(axis))
-
-
-def test_the_nearest_reference_is_shown(capture, open_pair):
-    image = capture["ios_map"].image_name(3)
-    query = LocalizedQuery(query_images(capture, "ios"), [image])
-    details = open_pair("ios", query, method="nearest", status="low_confidence").details(0)
-    assert [reference.name for reference in details.references] == [image]
-    assert not details.has_matches
 
 
 def test_a_failed_query_shows_its_matches_and_stands_at_its_first_reference(capture, open_pair):

@@ -223,16 +223,15 @@ def reason_in_words(
 
 
 def _why_failed(detail: str, numbers: Mapping[str, float], settings: LocalizeSettings) -> str:
-    count, least = int(numbers.get("num_matches", 0)), settings.pnp.min_inliers
-    if detail == "too few matches":
-        return f"No pose: {count} matches with the map are too few to compute one."
-    if detail == "no consistent pose":
-        return f"No pose: too few of {count} matches agree on any pose."
+    count = int(numbers.get("num_matches", 0))
+    sentences = {
+        "too few matches": f"{count} matches with the map are too few to compute one",
+        "no consistent pose": f"too few of {count} matches agree on any pose",
+        "no references": "the retrieval has no references for this query",
+    }
     if detail.startswith("too few inliers"):
-        return f"No pose: {detail} among {count} matches; at least {least} are required."
-    if detail == "no references":
-        return "No pose: the retrieval has no references for this query."
-    return f"No pose: {detail}."
+        return f"No pose: {detail} among {count} matches; at least {settings.pnp.min_inliers} are required."
+    return f"No pose: {sentences.get(detail, detail)}."
 
 
 def _doubts(numbers: Mapping[str, float], settings: LocalizeSettings) -> list[str]:

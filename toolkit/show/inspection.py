@@ -160,38 +160,35 @@ class InspectedPair:
         names = self.localized.query_session.image_names
         images = {names[row]: number for number, rows in enumerate(self.localized.rows) for row in rows}
         number = find_query(query, images, len(self))
-        row, pose = self.localized.table.iloc[number], self.localized.world_from_rig[number]
-        stated = str(row["reason"]) if pd.notna(row.get("reason")) else ""
-        covariance = self._covariances.get((int(row["timestamp"]), str(row["device_id"])))
+        row = self.localized.table.iloc[number]
+        found = {name: value for name, value in row.items() if pd.notna(value)}
+        found["covariance"] = self._covariances.get((int(row["timestamp"]), str(row["device_id"])))
         return self._inspection(
-            number, row, str(row["status"]), stated, str(row["method"]), self.localized.localized(number),
-            pose if is_posed(pose) else None, covariance, self.settings, float(row.get("seconds", np.nan)),
-        )  # fmt: skip
+            number, found, self.localized.world_from_rig[number], self.localized.localized(number), self.settings
+        )
 
     def localize(self, number: int, changes: Mapping[str, Any]) -> Inspection:
         """Localize a query again; see `Inspection.again`."""
         settings = self._again.settings(changes)
         estimate, localized, seconds = self._again.localize(self.localized.rows[number], settings)
-        values = {name: getattr(estimate, name) for name in LABELS}
-        method = label(settings, "" if estimate.world_from_rig is None else estimate.found_by)
-        return self._inspection(
-            number, values, estimate.status, estimate.reason, method, localized, estimate.world_from_rig,
-            estimate.covariance, settings, seconds,
-        )  # fmt: skip
+        found = {name: getattr(estimate, name) for name in (*LABELS, "status", "reason", "covariance")}
+        found["method"] = label(settings, "" if estimate.world_from_rig is None else estimate.found_by)
+        return self._inspection(number, found | {"seconds": seconds}, estimate.world_from_rig, localized, settings)
 
     def _inspection(
-        self, number: int, values: Mapping[str, Any], status: str, stated: str, method: str, localized: LocalizedQuery,
-        pose: Floats | None, covariance: Floats | None, settings: LocalizeSettings, seconds: float,
+        self, number: int, found: Mapping[str, Any], pose: Floats | None, localized: LocalizedQuery,
+        settings: LocalizeSettings,
     ) -> Inspection:  # fmt: skip
-        """Add to a result what is known about the query: unit of lengths, retrieval."""
-        numbers = {name: float(values[name]) for name in LABELS if name in values and np.isfinite(values[name])}
+        """Return a result; `found`: its status, reason, method, covariance, seconds and numbers, as far as known."""
+        numbers = {name: float(found[name]) for name in LABELS if name in found and np.isfinite(found[name])}
         if "position_std_m" in numbers:
             numbers["position_std_m"] /= self.localized.unit[1]
-        if covariance is not None and not np.isfinite(covariance).all():
-            covariance = None
+        covariance = found["covariance"]
         return Inspection(
-            self.localized, number, status, stated, method, numbers, localized, pose, covariance, settings, seconds,
-            self._retrieved(number), of=self,
+            self.localized, number, str(found["status"]), str(found.get("reason", "")), str(found["method"]), numbers,
+            localized, pose if pose is not None and is_posed(pose) else None,
+            covariance if covariance is not None and np.isfinite(covariance).all() else None,
+            settings, float(found.get("seconds", np.nan)), self._retrieved(number), of=self,
         )  # fmt: skip
 
     @cached_property

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.lines import Line2D
 
-from toolkit.geometry import Floats
+from toolkit.geometry import Floats, shifted
 from toolkit.localizers.correspondences import Correspondences
 from toolkit.show.answers import Answer, folder_of
 from toolkit.show.figures import BLUE, ESTIMATED, GRAY, MAP, ORANGE, TRUE, new_figure, styled
@@ -83,13 +83,11 @@ def _marks_of(correspondences: Correspondences) -> list[Line2D]:
     return marks
 
 
-def _ground(answer: Answer, poses: Floats) -> Ground:
-    return Ground.below(poses, answer.settings.world_up, answer.pair.unit)
-
-
-def _map_poses(answer: Answer) -> Floats:
+def _ground_and_cameras(answer: Answer) -> tuple[Ground, Floats]:
+    """Return the ground of the map, and the poses of its cameras (N, 4, 4)."""
     poses = answer.pair.map_session.world_from_cam()
-    return poses[is_posed(poses)]
+    poses = poses[is_posed(poses)]
+    return Ground.below(poses, answer.settings.world_up, answer.pair.unit), poses
 
 
 def _cameras_of(answers: Sequence[Answer]) -> list[tuple[Floats, str, str]]:
@@ -110,8 +108,8 @@ def _dot(pose: Floats, name: str, color: str, heading: float = 0.0) -> Layer:
 def _draw_from_above(axis: "Axes", answers: Sequence[Answer]) -> None:
     """Draw the place of the map around the query from above: map points, cameras, references, poses, rivals, truth."""
     answer = answers[0]
-    cameras = _map_poses(answer)
-    ground, points = _ground(answer, cameras), sure_points(answer.pair.local_map)[0]
+    ground, cameras = _ground_and_cameras(answer)
+    points = sure_points(answer.pair.local_map)[0]
     points = points[:: len(points) // MAX_POINTS + 1]
     references = np.array([image.world_from_cam for image in answer.details.references]).reshape(-1, 4, 4)
     shown = _cameras_of(answers)
@@ -154,9 +152,9 @@ def _draw_near(axis: "Axes", answers: Sequence[Answer]) -> None:
         axis.text(0.5, 0.5, "no pose", ha="center", va="center", color=GRAY)
         return
     unit, length = posed[0].pair.unit
-    ground, shown = _ground(posed[0], _map_poses(posed[0])), _cameras_of(answers)
-    # Relative to the pose, or rounding of large coordinates would show.
-    shown = [(_moved(pose, shown[0][0]), name, color) for pose, name, color in shown]
+    ground, shown = _ground_and_cameras(posed[0])[0], _cameras_of(answers)
+    origin = -shown[0][0][:3, 3]
+    shown = [(shifted(pose, origin), name, color) for pose, name, color in shown]
     ellipses, reach = [], [float(np.abs(ground.flat(pose)).max()) for pose, _, _ in shown]
     for (pose, name, color), answer in zip(shown, posed, strict=False):  # the truth is shown last
         if answer.covariance is None:
@@ -179,13 +177,6 @@ def _draw_near(axis: "Axes", answers: Sequence[Answer]) -> None:
     axis.set_title(f"the pose, enlarged{'' if ellipses else ': the method states no uncertainty'}", fontsize=9)
     axis.grid(alpha=0.25)
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=7.5)
-
-
-def _moved(pose: Floats, origin: Floats) -> Floats:
-    """Return a pose with its position relative to that of another."""
-    moved = pose.copy()
-    moved[:3, 3] -= origin[:3, 3]
-    return moved
 
 
 def _position_covariance(answer: Answer, rig_from_cam: Floats) -> Floats:

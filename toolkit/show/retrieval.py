@@ -200,7 +200,7 @@ def draw_retrieved(query: RetrievedQuery) -> "Figure":
         known, good = np.isfinite(hit.overlap), hit.overlap >= LEAST_OVERLAP
         text = f"{hit.rank}: {hit.score:.2f}" + (f", overlap {hit.overlap:.0%}" if known else "")
         color = (GREEN if good else ORANGE) if known else GRAY
-        image = np.full((3, 4), 230, np.uint8) if row is None else map_session.image_path(row)
+        image = np.full((3, 4, 3), 230, np.uint8) if row is None else map_session.image_path(row)
         draw_image(panel, image, 2.4, text if row is not None else f"{text}, not in the capture", color, color)
     along, above = below.subplots(1, 2, width_ratios=[1.6, 1.0])
     _draw_along(along, query)
