@@ -29,7 +29,7 @@ test: $(INSTALLED)  ## run the default tests, 4 to 8 minutes on 2 idle cores
 test-kernels: $(INSTALLED)  ## run the tests of numbers with other BLAS kernels and numbers of threads
 	@set -e; for kernel in Haswell Prescott; do for threads in 1 2; do echo "$$kernel, $$threads BLAS threads"; \
 	OPENBLAS_CORETYPE=$$kernel OPENBLAS_NUM_THREADS=$$threads $(PYTEST) tests/test_threads.py tests/test_localize.py \
-	tests/test_geometry.py tests/features tests/embedders tests/localizers; done; done
+	tests/test_geometry.py tests/features tests/embedders tests/alignment tests/mapping tests/pose tests/prediction tests/scene tests/sequences; done; done
 
 test-slow: $(INSTALLED)  ## run the slow tests: whole runs, and accuracy on real captures if present
 	$(PYTEST) -m slow

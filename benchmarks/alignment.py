@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
-from toolkit.localizers.alignment import align_to_map, is_trustworthy, query_pose
+from toolkit.alignment.similarity import align_to_map, is_trustworthy, query_pose
 
 Floats = NDArray[np.float64]
 QUERY_M = 3.0

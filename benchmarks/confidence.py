@@ -1,4 +1,4 @@
-"""How probable is it that a pose is right? Fits the weights of `toolkit/localizers/confidence.py`.
+"""How probable is it that a pose is right? Fits the weights of `toolkit/pose/confidence.py`.
 
     python benchmarks/confidence.py FOLDER CAPTURE... [--rendered 0 1] [--alike 0 1] [--rows ROWS.csv] [--out FILE.md]
         [--held-out SCENE]...
@@ -169,7 +169,7 @@ def fit(rows: pd.DataFrame, ridge: float = 1.0) -> NDArray[np.float64]:
     """Return the weights of `terms` that tell right poses from wrong ones best."""
     from scipy.optimize import minimize
 
-    from toolkit.localizers.confidence import EVIDENCE, WEIGHTS, terms
+    from toolkit.pose.confidence import EVIDENCE, WEIGHTS, terms
 
     rows = rows[rows["posed"] & ~rows["refused"]]
     x = terms({name: rows[name].to_numpy(np.float64) for name in EVIDENCE})
@@ -194,7 +194,7 @@ def fit(rows: pd.DataFrame, ridge: float = 1.0) -> NDArray[np.float64]:
 
 def stated(rows: pd.DataFrame, weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the probability of each row, bounded as in the localizer; 0 where there is no pose or no deviation."""
-    from toolkit.localizers.confidence import EVIDENCE, bounded_by_deviation, bounded_by_rivals, probability_right
+    from toolkit.pose.confidence import EVIDENCE, bounded_by_deviation, bounded_by_rivals, probability_right
 
     evidence = {name: rows[name].to_numpy(np.float64) for name in EVIDENCE}
     alone = np.where(rows["posed"], probability_right(evidence, weights), 0.0)
@@ -207,7 +207,7 @@ def judge(rows: pd.DataFrame, probability: NDArray[np.float64]) -> dict[str, flo
     """Return what is called `ok`, and how wrong it is."""
     from scipy.stats import beta
 
-    from toolkit.localizers.pnp import MAX_RIVAL_SUPPORT
+    from toolkit.pose.pnp import MAX_RIVAL_SUPPORT
 
     accepted = (probability >= OK) & ~rows["refused"] & (rows["rival_support"] <= MAX_RIVAL_SUPPORT)
     wrong, count = int((accepted & rows["wrong"]).sum()), int(accepted.sum())
@@ -218,7 +218,7 @@ def judge(rows: pd.DataFrame, probability: NDArray[np.float64]) -> dict[str, flo
 
 def markdown(rows: pd.DataFrame, held_out: list[str]) -> str:
     """Return the weights, and how they hold on scenes that they were not fitted on."""
-    from toolkit.localizers.confidence import WEIGHTS
+    from toolkit.pose.confidence import WEIGHTS
 
     learned, other = rows[~rows["scene"].isin(held_out)], rows[rows["scene"].isin(held_out)]
     weights = fit(learned)

@@ -78,8 +78,8 @@ def run_toolkit(
     from toolkit import embed, localize, retrieve
     from toolkit.features import stores
     from toolkit.files import SceneFiles
-    from toolkit.localizers import map as map_module
-    from toolkit.localizers.local_map import LocalMap
+    from toolkit.mapping.local_map import LocalMap
+    from toolkit.scene import map as map_module
 
     imported = _clocks()
     files = SceneFiles(run, sessions_root.parent.name)
@@ -165,15 +165,15 @@ def measure_toolkit(
 
 
 PLAIN = {"GUIDED_RADII_DEG": (), "CLEAR_INLIER_RATIO": 0.0}
-"""Constants of `localizers/pnp.py` of the plain setting: no guided matching, no search for rivals."""
+"""Constants of `pose/pnp.py` of the plain setting: no guided matching, no search for rivals."""
 
 
 def localize_plainly(sessions_root: Path, run: Path, queries: str, threads: int) -> list[float]:
     """Localize in a finished run's maps with the plain setting; returns wall and CPU seconds."""
     from toolkit import localize
     from toolkit.files import SceneFiles
-    from toolkit.localizers import map as map_module
-    from toolkit.localizers import pnp
+    from toolkit.pose import pnp
+    from toolkit.scene import map as map_module
 
     files = SceneFiles(run, sessions_root.parent.name)
     inner = _time_parts(localize, map_module)

@@ -293,22 +293,22 @@ class Books:
         self.cameras = session.cameras()
 
     def select_pairs(self) -> None:
-        from toolkit.localizers.mapping import instants, select_pairs
+        from toolkit.mapping.build import instants, select_pairs
 
         session = self.capture["ios_map"]
         groups = instants(session, np.arange(len(self.poses)))
         self.pairs = select_pairs(self.poses, self.cameras, groups)
 
     def plan_tiles(self) -> None:
-        from toolkit.localizers.tiles import plan_tiles
         from toolkit.manifest import MapSettings
+        from toolkit.mapping.tiles import plan_tiles
 
         self.tiles = plan_tiles(self.poses[:, :3, 3] + 4 * self.poses[:, :3, 2], self.pairs, MapSettings().tile_images)
 
     def write_tiles(self) -> None:
         """Write tiles of random points: 50 before each image, which up to three of its partners see, too."""
         from toolkit.geometry import transform
-        from toolkit.localizers.local_map import LocalMap
+        from toolkit.mapping.local_map import LocalMap
 
         count, each = len(self.poses), 50
         starts = np.searchsorted(self.pairs[:, 0], np.arange(count + 1))
@@ -342,8 +342,8 @@ class Books:
 
     def join_tiles(self) -> None:
         from toolkit.geometry import invert, transform
-        from toolkit.localizers.local_map import LocalMap
-        from toolkit.localizers.tiles import JoinedImages, join_tiles
+        from toolkit.mapping.local_map import LocalMap
+        from toolkit.mapping.tiles import JoinedImages, join_tiles
 
         def keypoints(image: int) -> np.ndarray:
             seen = self.points[self.obs_point[slice(*self.starts[image : image + 2])]]
@@ -368,7 +368,7 @@ class Books:
         del self.obs_image, self.obs_point, self.points
 
     def open_map(self) -> None:
-        from toolkit.localizers.local_map import LocalMap
+        from toolkit.mapping.local_map import LocalMap
 
         opened = LocalMap.load(self.run / "map.npz")
         for image in np.linspace(0, len(self.poses) - 1, 100).astype(int):
@@ -413,7 +413,7 @@ def keep_books(folder: Path, images: int) -> dict[str, dict[str, float]]:
     from threadpoolctl import threadpool_limits
 
     import toolkit.evaluate
-    import toolkit.localizers.mapping  # noqa: F401  # that imports take time is no matter of size
+    import toolkit.mapping.build  # noqa: F401  # that imports take time is no matter of size
 
     shutil.rmtree(folder, ignore_errors=True)
     books, found = Books(folder, images), dict[str, dict[str, float]]()

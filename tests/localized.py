@@ -9,7 +9,7 @@ import pandas as pd
 
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.files import pair_name
-from toolkit.localizers.correspondences import MAPS, Correspondences, LocalizedQuery, query_group
+from toolkit.pose.correspondences import MAPS, Correspondences, LocalizedQuery, query_group
 from toolkit.store.hdf5 import write_groups
 
 

@@ -11,8 +11,8 @@ from toolkit import geometry
 from toolkit.capture import Session
 from toolkit.features.features import LocalFeatures
 from toolkit.features.stores import FeatureStore
-from toolkit.localizers.base import NetworkMatches, PoseEstimate, Query, References, View
-from toolkit.localizers.local_map import LocalMap
+from toolkit.mapping.local_map import LocalMap
+from toolkit.pose.base import NetworkMatches, PoseEstimate, Query, References, View
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -14,11 +14,11 @@ from tests.queries import likeness, session_query
 from toolkit.capture import Capture, Session
 from toolkit.files import SceneFiles
 from toolkit.localize import localize_pairs
-from toolkit.localizers.base import QueryInput
-from toolkit.localizers.feed_forward import FeedForwardLocalizer
-from toolkit.localizers.local_map import LocalMap
-from toolkit.localizers.simulated import SimulatedPredictor
 from toolkit.manifest import PredictorSettings
+from toolkit.mapping.local_map import LocalMap
+from toolkit.pose.base import QueryInput
+from toolkit.prediction.feed_forward import FeedForwardLocalizer
+from toolkit.prediction.simulated import SimulatedPredictor
 
 Floats = NDArray[np.float64]
 LIST = "keyframes_original"

@@ -15,7 +15,7 @@ from toolkit.errors import CaptureError, ToolkitError
 from toolkit.evaluate import draw_evaluation, evaluate_scene, pose_errors, recall
 from toolkit.files import write_sidecar
 from toolkit.geometry import make_pose, pose_error
-from toolkit.localizers.local_map import LocalMap
+from toolkit.mapping.local_map import LocalMap
 
 CAMERA_MODEL = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[500, 500, 320, 240])
 CAMERA = ("camera", "PINHOLE", "640", "480", "500", "500", "320", "240")

@@ -27,8 +27,8 @@ from toolkit.files import (
     why_older,
     write_sidecar,
 )
-from toolkit.localizers.map import Map
 from toolkit.notebook import notebook_path
+from toolkit.scene.map import Map
 from toolkit.show.comparison import compare_runs
 from toolkit.show.inspection import inspect_query
 from toolkit.show.report import write_report

@@ -39,20 +39,21 @@ from toolkit.features.sift import SiftExtractor, SiftSettings
 from toolkit.features.stores import extract_session
 from toolkit.files import SceneFiles, image_name, map_record_path, read_map_record, read_references, sidecar_path
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
-from toolkit.localizers import create_localizer, predictors
-from toolkit.localizers import map as maps
-from toolkit.localizers.base import PoseEstimate, Prior, Query, RoughPose, View
-from toolkit.localizers.correspondences import LocalizedQueries
-from toolkit.localizers.escalation import EscalatingLocalizer
-from toolkit.localizers.local_map import LocalMap
-from toolkit.localizers.matches import MappedFeatures
-from toolkit.localizers.picture import pixels_from
-from toolkit.localizers.pnp import PnpLocalizer
-from toolkit.localizers.prediction import Prediction
-from toolkit.localizers.simulated import SimulatedPredictor
 from toolkit.manifest import EmbedSettings, LocalizeSettings
+from toolkit.mapping.local_map import LocalMap
+from toolkit.pose.base import PoseEstimate, Prior, Query, RoughPose, View
+from toolkit.pose.correspondences import LocalizedQueries
+from toolkit.pose.escalation import EscalatingLocalizer
+from toolkit.pose.map_matching import MappedFeatures
+from toolkit.pose.pnp import PnpLocalizer
+from toolkit.prediction import registry as predictors
+from toolkit.prediction.interface import Prediction
+from toolkit.prediction.simulated import SimulatedPredictor
 from toolkit.rerank import rerank_pairs
 from toolkit.retrieve import load_embeddings, retrieve_pairs
+from toolkit.scene import create_localizer
+from toolkit.scene import map as maps
+from toolkit.scene.locate import pixels_from
 from toolkit.sequence import sequence_pairs
 from toolkit.show.inspection import InspectedPair
 

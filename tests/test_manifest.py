@@ -297,7 +297,7 @@ def test_stages_have_few_settings_and_a_former_one_is_told_where_its_constant_is
             assert (REPOSITORY / "toolkit" / file).is_file()
             assert not {*names.split()} & {*section.model_fields}
     path = write(tmp_path, "captures: [here]\nlocalize: {pnp: {guided_images: 9}}\n")
-    with pytest.raises(ManifestError, match=r"'localize\.pnp\.guided_images': .* in toolkit/localizers/matches\.py\."):
+    with pytest.raises(ManifestError, match=r"'localize\.pnp\.guided_images': .* in toolkit/pose/map_matching\.py\."):
         load_manifest(path)
 
 

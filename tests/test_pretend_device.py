@@ -12,21 +12,21 @@ from tests.features.test_aliked import SETTINGS, Small
 from tests.features.test_aliked import random_state as aliked_state
 from tests.features.test_lightglue import features, state
 from tests.features.test_superpoint import planted_state
-from tests.localizers.test_network_predictor import HIGHER, WIDE, Photographs, assert_same
 from tests.models import test_da3 as da3
 from tests.models import test_omega as omega
 from tests.models.test_megaloc import tiny_megaloc
 from tests.models.test_vggt import tiny
+from tests.prediction.test_network_predictor import HIGHER, WIDE, Photographs, assert_same
 from tests.pretend import DEVICE, PretendTensor, pretending, resolved
 from toolkit.embedders import megaloc, search
 from toolkit.features import lightglue, network
 from toolkit.features.lightglue import LightGlueMatcher
 from toolkit.features.network import NetworkExtractor
 from toolkit.features.superpoint import SuperPointExtractor
-from toolkit.localizers import network as predictors
-from toolkit.localizers.network import NetworkPredictor
 from toolkit.manifest import AlikedSettings, SuperPointSettings
 from toolkit.models.vggt import VGGT
+from toolkit.prediction import network as predictors
+from toolkit.prediction.network import NetworkPredictor
 
 __all__ = ["state"]  # a fixture
 

@@ -27,6 +27,7 @@ from hypothesis.extra import numpy as arrays
 from tests.conftest import REPOSITORY
 from tests.fuzz.targets import ODD, SESSION_FILES, use_session
 from toolkit import geometry
+from toolkit.alignment.similarity import Sim3, align_to_map
 from toolkit.capture import Session, Trajectory, camera_text, parse_camera, read_depth, write_depth, write_session
 from toolkit.capture.names import is_bad_name
 from toolkit.capture.tables import COLUMNS, KeyIndex, read_query_table, read_table
@@ -34,9 +35,8 @@ from toolkit.embedders.search import search
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
 from toolkit.exchange.submission import Submission
 from toolkit.files import read_references
-from toolkit.localizers.alignment import Sim3, align_to_map
-from toolkit.localizers.correspondences import Correspondences, LocalizedQueries, LocalizedQuery, query_group
 from toolkit.manifest import STAGES, Manifest, load_manifest
+from toolkit.pose.correspondences import Correspondences, LocalizedQueries, LocalizedQuery, query_group
 from toolkit.store.hdf5 import write_groups
 from toolkit.store.items import Items
 

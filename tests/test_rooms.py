@@ -20,8 +20,13 @@ LEVELS: list[tuple[str, ...]] = [
     ("store",),
     ("features",),
     ("embedders",),
-    ("localizers",),
-    ("alignment", "exchange", "show", "synthetic"),
+    ("alignment",),
+    ("mapping",),
+    ("pose",),
+    ("prediction",),
+    ("scene",),
+    ("sequences",),
+    ("exchange", "show", "synthetic"),
     STAGES,
     ("notebook",),
     ("pipeline",),
@@ -87,10 +92,7 @@ def test_no_module_imports_itself_through_others() -> None:
 
 def test_the_top_level_is_a_table_of_contents() -> None:
     files = {path.stem for path in TOOLKIT.glob("*.py")} - {"__init__"}
-    assert files == {"__main__", "pipeline", "notebook", *STAGES, "geometry", "files", "threads", "errors"} | (
-        {"alignment"}  # the name that other code imports; the work is done in localizers/
-        | set()
-    )
+    assert files == {"__main__", "pipeline", "notebook", *STAGES, "geometry", "files", "threads", "errors"}
 
 
 def test_a_wheel_has_every_file_that_is_no_module() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.localizers.drifting import PLACE, Drive, drive, lost_in_a_gap, small_motion
+from tests.sequences.drifting import PLACE, Drive, drive, lost_in_a_gap, small_motion
 from toolkit import geometry, sequence
 from toolkit.capture import Session, Trajectory
 from toolkit.capture.tables import as_strings, read_query_table
@@ -19,10 +19,10 @@ from toolkit.embed import embed_sessions
 from toolkit.errors import ManifestError
 from toolkit.files import SceneFiles, map_record_path, pair_name
 from toolkit.localize import localize_pairs
-from toolkit.localizers.base import PoseEstimate
-from toolkit.localizers.pose_graph import FAR
+from toolkit.pose.base import PoseEstimate
 from toolkit.retrieve import retrieve_pairs
 from toolkit.sequence import COLUMNS, sequence_pairs
+from toolkit.sequences.pose_graph import FAR
 from toolkit.synthetic import capture as rendering
 from toolkit.synthetic import render_capture
 from toolkit.synthetic.devices import DEVICES, scaled

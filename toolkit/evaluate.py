@@ -54,7 +54,7 @@ from toolkit.show.overlap import LEAST_OVERLAP, overlap_in_view, seen_by
 from toolkit.show.sequences import SequencePair
 
 if TYPE_CHECKING:
-    from toolkit.localizers.local_map import LocalMap
+    from toolkit.mapping.local_map import LocalMap
 
 logger = logging.getLogger(__name__)
 

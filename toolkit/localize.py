@@ -38,17 +38,25 @@ from toolkit.files import (
     write_sidecar,
     write_text,
 )
-from toolkit.localizers.base import (
+from toolkit.manifest import LocalizeSettings
+from toolkit.mapping.build import map_settings
+from toolkit.pose.base import (
     Localizer,
     PoseEstimate,
     Query,
     References,
     ScaledLocalizer,
 )
-from toolkit.localizers.correspondences import MAPS, LocalizedQuery, query_group
-from toolkit.localizers.escalation import EscalatingLocalizer, can_gain, is_better, is_sure, known_poses
-from toolkit.localizers.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
-from toolkit.localizers.map import (
+from toolkit.pose.correspondences import MAPS, LocalizedQuery, query_group
+from toolkit.pose.escalation import EscalatingLocalizer, can_gain, is_better, is_sure, known_poses
+from toolkit.pose.intrinsics_check import MAX_SHARES, SIGNIFICANCE
+from toolkit.pose.pnp import PNP_FORMAT
+from toolkit.pose.stored_queries import localized_query, references_of_images, stored_query
+from toolkit.prediction.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
+from toolkit.prediction.registry import open_predictor
+from toolkit.runs.pairs import PairRows
+from toolkit.scene.locate import localize_image
+from toolkit.scene.map import (
     Map,
     attributes,
     create_localizer,
@@ -58,14 +66,6 @@ from toolkit.localizers.map import (
     session_fingerprint,
     update_attributes,
 )
-from toolkit.localizers.mapping import map_settings
-from toolkit.localizers.misfit import MAX_SHARES, SIGNIFICANCE
-from toolkit.localizers.picture import localize_image
-from toolkit.localizers.pnp import PNP_FORMAT
-from toolkit.localizers.predictors import open_predictor
-from toolkit.localizers.queries import localized_query, references_of_images, stored_query
-from toolkit.manifest import LocalizeSettings
-from toolkit.runs.pairs import PairRows
 from toolkit.show.metrics import camera_messages
 from toolkit.store.hdf5 import write_groups
 from toolkit.store.items import Items, heals
@@ -106,7 +106,7 @@ def localize_pairs(
     """Localize the queries of every pair of map device and query device.
 
     For each pair, writes the poses (`<pair>.txt`), a table with the status and quality of each (`<pair>.csv`), and the
-    correspondences that support each pose (`<pair>.h5`, see `localizers.correspondences`). For each map, writes
+    correspondences that support each pose (`<pair>.h5`, see `pose.correspondences`). For each map, writes
     `<scene>_map_<device>.json`, which says whether the map's poses agree with its images.
 
     Args:

@@ -38,8 +38,6 @@ from toolkit.files import (
     read_json,
     write_text,
 )  # fmt: skip
-from toolkit.localizers.architectures import ARCHITECTURES
-from toolkit.localizers.pose_graph import require_gtsam
 from toolkit.manifest import (
     STAGES,
     EmbedSettings,
@@ -66,12 +64,14 @@ from toolkit.notebook import (
     stage_outputs,
     work_seconds,
 )
+from toolkit.prediction.architectures import ARCHITECTURES
 from toolkit.runs.cluster import open_cluster
 from toolkit.runs.folder import LOG, held, warnings_of_kernels
 from toolkit.runs.kernel import Kernels
 from toolkit.runs.pairs import pair_text, way_out
 from toolkit.runs.record import OLDER, Earlier, RunLog, failures
 from toolkit.runs.sweep import Shared, SweptRun, changed_keys, swept_runs, take_over, variant_name
+from toolkit.sequences.pose_graph import require_gtsam
 
 log = logging.getLogger(__name__)
 

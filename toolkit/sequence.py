@@ -33,10 +33,12 @@ from toolkit.files import (
     write_sidecar,
 )
 from toolkit.geometry import Floats, Ints, pose_error
-from toolkit.localizers.base import PoseEstimate, RoughPose, stds_of
-from toolkit.localizers.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
-from toolkit.localizers.map import Map
-from toolkit.localizers.odometry import (
+from toolkit.manifest import SequenceSettings
+from toolkit.pose.base import PoseEstimate, RoughPose, stds_of
+from toolkit.scene.locate import localize_image
+from toolkit.scene.map import Map
+from toolkit.sequences.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
+from toolkit.sequences.odometry import (
     UNKNOWN_COVARIANCE,
     Odometry,
     PosedQueries,
@@ -47,10 +49,8 @@ from toolkit.localizers.odometry import (
     vote_weights,
     with_measured_drift,
 )
-from toolkit.localizers.picture import localize_image
-from toolkit.localizers.pose_graph import place_online
-from toolkit.localizers.recording import localize_piece
-from toolkit.manifest import SequenceSettings
+from toolkit.sequences.piece import localize_piece
+from toolkit.sequences.pose_graph import place_online
 from toolkit.threads import fixed_sums
 
 log = logging.getLogger(__name__)

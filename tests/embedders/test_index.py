@@ -219,6 +219,6 @@ def test_there_are_as_many_candidates_as_references(place: Path, tmp_path: Path)
 
 @pytest.mark.slow
 def test_an_index_that_is_not_asked_for_loads_no_torch() -> None:
-    code = "import sys, toolkit.retrieve, toolkit.localizers.map; sys.exit('torch' in sys.modules)"
+    code = "import sys, toolkit.retrieve, toolkit.scene.map; sys.exit('torch' in sys.modules)"
     root = Path(index_module.__file__).parents[2]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0

@@ -21,9 +21,9 @@ from toolkit.exchange.interchange import import_colmap, import_images
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import SceneFiles, pair_name
 from toolkit.geometry import invert, pose_from_qt
-from toolkit.localizers.correspondences import MAPS
-from toolkit.localizers.local_map import LocalMap
-from toolkit.localizers.mapping import build_map
+from toolkit.mapping.build import build_map
+from toolkit.mapping.local_map import LocalMap
+from toolkit.pose.correspondences import MAPS
 
 
 def write_localization(files: SceneFiles, map_device: str, query_device: str, maps: list[str]) -> None:

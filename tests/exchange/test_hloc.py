@@ -27,8 +27,8 @@ from toolkit.features.stores import (
     write_matches,
 )  # fmt: skip
 from toolkit.files import SceneFiles
-from toolkit.localizers.mapping import build_map
 from toolkit.manifest import MapSettings
+from toolkit.mapping.build import build_map
 from toolkit.store.items import Items
 
 SETTINGS = {"name": "sift"}

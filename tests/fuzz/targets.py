@@ -27,8 +27,8 @@ from toolkit.exchange import interchange
 from toolkit.exchange.hloc import import_features
 from toolkit.exchange.interchange import import_colmap, import_images
 from toolkit.files import read_references
-from toolkit.localizers.correspondences import Correspondences, LocalizedQueries, LocalizedQuery
 from toolkit.manifest import load_manifest
+from toolkit.pose.correspondences import Correspondences, LocalizedQueries, LocalizedQuery
 from toolkit.store.hdf5 import write_groups
 
 

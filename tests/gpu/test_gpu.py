@@ -30,9 +30,6 @@ from toolkit.errors import ToolkitError
 from toolkit.features.lightglue import LightGlueMatcher
 from toolkit.features.network import NetworkExtractor
 from toolkit.features.superpoint import SuperPointExtractor
-from toolkit.localizers import network
-from toolkit.localizers.base import View
-from toolkit.localizers.network import NetworkPredictor
 from toolkit.manifest import AlikedSettings
 from toolkit.models.compute import full_float32
 from toolkit.models.da3 import DepthAnything3
@@ -40,6 +37,9 @@ from toolkit.models.da3.backbone import choose_reference
 from toolkit.models.megaloc import MegaLoc
 from toolkit.models.omega import VGGTOmega
 from toolkit.models.vggt import VGGT
+from toolkit.pose.base import View
+from toolkit.prediction import network
+from toolkit.prediction.network import NetworkPredictor
 
 __all__ = ["golden", "lightglue_state"]  # fixtures
 

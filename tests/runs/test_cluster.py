@@ -29,9 +29,9 @@ from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import Remade, SceneFiles
 from toolkit.localize import localize_pairs
-from toolkit.localizers import mapping
-from toolkit.localizers.mapping import build_map
 from toolkit.manifest import MapSettings
+from toolkit.mapping import build as mapping
+from toolkit.mapping.build import build_map
 from toolkit.retrieve import retrieve_pairs
 from toolkit.runs import cluster as clusters
 from toolkit.runs.cluster import ADDRESS, Cluster, current_cluster, open_cluster
@@ -69,7 +69,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> Here:
             frame = frame.f_back  # type: ignore[assignment]
         return cluster
 
-    for module in ("toolkit.store.items", "toolkit.localizers.mapping"):
+    for module in ("toolkit.store.items", "toolkit.mapping.build"):
         monkeypatch.setattr(f"{module}.current_cluster", current)
     return cluster
 
@@ -203,7 +203,7 @@ def test_poses_are_those_of_one_process(
         place = SceneFiles(tmp_path / name, small_capture.name)
         with pytest.MonkeyPatch.context() as patch:
             if name == "alone":
-                for module in ("toolkit.store.items", "toolkit.localizers.mapping"):
+                for module in ("toolkit.store.items", "toolkit.mapping.build"):
                     patch.setattr(f"{module}.current_cluster", lambda: None)
             folders = files.retrieval_dir, place.poses_dir, files.features, place.maps
             localize_pairs(sessions, *folders, settings, map_device="ios")

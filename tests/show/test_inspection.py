@@ -18,8 +18,8 @@ from toolkit.errors import ArtifactError, ManifestError
 from toolkit.files import SceneFiles, map_record_path
 from toolkit.geometry import invert
 from toolkit.localize import localize_pairs
-from toolkit.localizers.correspondences import LocalizedQuery, Rival
 from toolkit.manifest import LocalizeSettings
+from toolkit.pose.correspondences import LocalizedQuery, Rival
 from toolkit.show.answers import reason_in_words
 from toolkit.show.choice import Choice, choose, find_query, shown_name
 from toolkit.show.inspection import Comparison, InspectedPair, WorstQueries, inspect_query
@@ -55,7 +55,7 @@ def written(
     """A pair written by hand, its attributes like those of a run."""
     import h5py
 
-    from toolkit.localizers.map import RETRIEVAL, SESSIONS_ROOT, SETTINGS
+    from toolkit.scene.map import RETRIEVAL, SESSIONS_ROOT, SETTINGS
 
     poses = folder / capture.name / "poses"
     stem = write_pair(Capture.open(capture), poses, "ios", device, queries, **columns)  # type: ignore[arg-type]

@@ -11,8 +11,8 @@ from toolkit.capture import Capture
 from toolkit.errors import ArtifactError
 from toolkit.files import write_sidecar
 from toolkit.geometry import make_pose
-from toolkit.localizers.correspondences import LocalizedQuery
-from toolkit.localizers.local_map import LocalMap
+from toolkit.mapping.local_map import LocalMap
+from toolkit.pose.correspondences import LocalizedQuery
 from toolkit.show import localized
 from toolkit.show.localized import LocalizedPair, load_maps, map_files, sure_points
 from toolkit.show.stills import draw_localization

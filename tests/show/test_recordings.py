@@ -14,8 +14,8 @@ from toolkit import geometry
 from toolkit.capture import Capture, Trajectory, write_depth, write_session
 from toolkit.errors import ArtifactError, CaptureError
 from toolkit.geometry import make_pose, quaternion_to_rotation
-from toolkit.localizers.correspondences import LocalizedQuery
-from toolkit.localizers.local_map import LocalMap
+from toolkit.mapping.local_map import LocalMap
+from toolkit.pose.correspondences import LocalizedQuery
 from toolkit.show.localization_view import record_localizations
 from toolkit.show.localized import Localizations, QueryDetails, ShownImage
 from toolkit.show.recordings import record_session, session_tracks

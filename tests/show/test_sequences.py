@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.localizers.drifting import drive, small_motion
+from tests.sequences.drifting import drive, small_motion
 from tests.test_sequence import drive_through, localized, place
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory

@@ -37,9 +37,9 @@ from toolkit.files import (
     write_text,
 )
 from toolkit.geometry import Floats, invert, pose_from_qt, qt_from_pose
-from toolkit.localizers.correspondences import LocalizedQueries
-from toolkit.localizers.local_map import LocalMap
 from toolkit.manifest import nearest
+from toolkit.mapping.local_map import LocalMap
+from toolkit.pose.correspondences import LocalizedQueries
 
 NAMES = ("own", "capture")
 Keypoints = Mapping[str, NDArray[np.floating]]

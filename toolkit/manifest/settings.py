@@ -378,7 +378,7 @@ class RerankSettings(Settings):
 class SequenceSettings(Settings):
     """Poses of whole recordings: a pose graph joins the odometry of the device and the poses of single queries."""
 
-    constants = {"localizers/odometry.py": "max_gap_s max_speed_m_s", "sequence.py": "windows_s"}
+    constants = {"sequences/odometry.py": "max_gap_s max_speed_m_s", "sequence.py": "windows_s"}
     position_drift: PositiveNumber = 0.03
     """Position drift of the odometry: standard deviation per axis after 1 m, in meters; grows with the square root of
     the distance. If the motions between `ok` queries show more drift, this and `rotation_drift_deg` are raised to fit
@@ -406,8 +406,8 @@ class MapSettings(Settings):
     """Triangulation of map points from the map images and their known poses."""
 
     constants = {
-        "localizers/mapping.py": "max_epipolar_error_px ratio",
-        "localizers/triangulation.py": "max_reprojection_error_px",
+        "mapping/build.py": "max_epipolar_error_px ratio",
+        "mapping/triangulation.py": "max_reprojection_error_px",
     }
     pairs_per_image: Positive = 14
     """Other map images that each map image is matched with."""
@@ -425,11 +425,11 @@ class PnpSettings(Settings):
     """Pose estimation from matches with map points. Errors are angles seen from the camera, in degrees."""
 
     constants = {
-        "localizers/pnp.py": "clear_inlier_ratio contested_inlier_ratio contested_references "
+        "pose/pnp.py": "clear_inlier_ratio contested_inlier_ratio contested_references "
         "guided_radii_deg max_guided_matches ok_rival_support",
-        "localizers/rig.py": "max_ransac_matches ransac_max_trials",
-        "localizers/matches.py": "guided_images max_map_features max_query_features",
-        "localizers/escalation.py": "sure_position_std_m",
+        "pose/rig.py": "max_ransac_matches ransac_max_trials",
+        "pose/map_matching.py": "guided_images max_map_features max_query_features",
+        "pose/escalation.py": "sure_position_std_m",
     }
     ransac_max_error_deg: PositiveNumber = 0.45
     """Largest reprojection error of an inlier in RANSAC, degrees."""
@@ -440,14 +440,14 @@ class PnpSettings(Settings):
     query has no pose."""
     ok_probability: Share = 0.99
     """A pose is `ok` only if the estimated probability that it is right (within 5 degrees and 0.5 m) reaches this
-    value; see `localizers/confidence.py`."""
+    value; see `pose/confidence.py`."""
 
 
 class PredictorSettings(Settings):
     """The feed-forward network that predicts cameras and depth from a query image and its references."""
 
     shorthand = "name"
-    constants = {"localizers/feed_forward.py": "depth_points least_points"}
+    constants = {"prediction/feed_forward.py": "depth_points least_points"}
     name: Literal["vggt", "vggt-omega", "da3-base", "da3-small", "simulated"] = "vggt"
     """Network of the methods `feed_forward` and `hybrid`. `simulated` looks up the true poses, for trials."""
     checkpoint: str | None = None

@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 
 from toolkit.geometry import Floats
-from toolkit.localizers.base import CAMERA
-from toolkit.localizers.confidence import bounded_by_rivals
-from toolkit.localizers.correspondences import Correspondences, LocalizedQuery, Rival
 from toolkit.manifest import LocalizeSettings
+from toolkit.pose.base import CAMERA
+from toolkit.pose.confidence import bounded_by_rivals
+from toolkit.pose.correspondences import Correspondences, LocalizedQuery, Rival
 from toolkit.show.figures import number
 from toolkit.show.localized import LocalizedPair, QueryDetails
 from toolkit.show.metrics import is_posed, pose_errors

@@ -15,7 +15,7 @@ from toolkit.embedders import embedding_folders, open_descriptors
 from toolkit.errors import CaptureError
 from toolkit.files import image_name, pair_devices, read_references
 from toolkit.geometry import Floats, qt_from_pose, unit
-from toolkit.localizers.odometry import Odometry, recordings_of
+from toolkit.sequences.odometry import Odometry, recordings_of
 from toolkit.show.figures import GREEN, ORANGE, VERMILLION, new_figure, plain_log, shared_legend, styled
 from toolkit.show.metrics import is_posed
 from toolkit.show.query_images import draw_image

@@ -19,10 +19,10 @@ from toolkit.capture import Capture, Trajectory
 from toolkit.errors import OF_THE_DATA, ArtifactError
 from toolkit.files import SceneFiles, image_name, pair_devices, read_references, require_current
 from toolkit.geometry import Floats
-from toolkit.localizers.again import LocalizeAgain
-from toolkit.localizers.correspondences import LocalizedQuery
-from toolkit.localizers.map import RETRIEVAL, SESSIONS_ROOT, Map, how_localized, label
 from toolkit.manifest import LocalizeSettings, nearest
+from toolkit.pose.correspondences import LocalizedQuery
+from toolkit.scene.map import RETRIEVAL, SESSIONS_ROOT, Map, how_localized, label
+from toolkit.scene.relocalize import LocalizeAgain
 from toolkit.show.answers import LABELS, Answer
 from toolkit.show.choice import find_query, shown_name
 from toolkit.show.figures import shown

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 from toolkit.geometry import Floats, shifted
-from toolkit.localizers.correspondences import Correspondences
+from toolkit.pose.correspondences import Correspondences
 from toolkit.show.answers import Answer, folder_of
 from toolkit.show.figures import BLUE, ESTIMATED, GRAY, MAP, ORANGE, TRUE, new_figure, styled
 from toolkit.show.localized import sure_points

@@ -17,8 +17,8 @@ from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError
 from toolkit.files import map_record_path, pair_name, read_map_record, require_whole
 from toolkit.geometry import Floats, Ints, invert
-from toolkit.localizers.correspondences import Correspondences, LocalizedQueries, LocalizedQuery
-from toolkit.localizers.local_map import LocalMap
+from toolkit.mapping.local_map import LocalMap
+from toolkit.pose.correspondences import Correspondences, LocalizedQueries, LocalizedQuery
 from toolkit.show.metrics import is_posed, length_unit, pose_errors, worst_first
 
 if TYPE_CHECKING:

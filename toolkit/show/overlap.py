@@ -12,7 +12,7 @@ from toolkit.geometry import Floats, invert, transform
 if TYPE_CHECKING:
     import pycolmap
 
-    from toolkit.localizers.local_map import LocalMap
+    from toolkit.mapping.local_map import LocalMap
 
 LEAST_OVERLAP = 0.1
 """A reference overlaps with a query if the query sees at least this share of the points that the reference sees."""

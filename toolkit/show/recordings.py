@@ -20,7 +20,7 @@ from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import ArtifactError, CaptureError, ImageError
 from toolkit.files import file_fingerprint, files_fingerprint, pair_devices, write_sidecar
 from toolkit.geometry import Floats, Ints, local_origin, shifted
-from toolkit.localizers.correspondences import LocalizedQueries, LocalizedQuery
+from toolkit.pose.correspondences import LocalizedQueries, LocalizedQuery
 from toolkit.show import viewer
 from toolkit.show.figures import ORANGE
 from toolkit.show.localized import load_maps, map_files, sure_points

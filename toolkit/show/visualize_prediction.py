@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from toolkit.localizers.base import Query, View
-from toolkit.localizers.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer
+from toolkit.pose.base import Query, View
+from toolkit.prediction.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.show.figures import BLUE, GRAY, GREEN, VERMILLION, new_figure, styled
 from toolkit.show.query_images import draw_image
 from toolkit.show.top_view import Ground, Layer, draw_layers, window_of

@@ -1,0 +1,161 @@
+"""Whether matches contradict the intrinsics of a query: known answers, and what noise alone does."""
+
+import numpy as np
+import pycolmap
+import pytest
+from numpy.typing import NDArray
+
+from toolkit import geometry
+from toolkit.pose.intrinsics_check import MAX_SHARES, Misfit, find_misfit
+from toolkit.pose.rig import Matches, RigQuery
+
+Floats = NDArray[np.float64]
+MAX_ERROR_DEG = 0.45
+SIZE = {"width": 960, "height": 640}
+TRUE = pycolmap.Camera(model="PINHOLE", **SIZE, params=[925, 925, 481.8, 317.9])
+TURNED = geometry.make_pose(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.array([0.2, 0.0, 0.1]))
+
+
+def changed(f: float = 1.0, x: float = 0.0, k1: float = 0.0) -> pycolmap.Camera:
+    """Return the true camera with another focal length, principal point (by the width) or radial distortion."""
+    params = [925 * f, 925 * f, 481.8 + 960 * x, 317.9, k1, 0, 0, 0]
+    return pycolmap.Camera(model="OPENCV", **SIZE, params=params)
+
+
+def scene(rng: np.random.Generator, rig_from_cams: Floats, count: int, depth: tuple[float, float]) -> tuple:
+    """Return matches of what true cameras see of points at some depth, with 0.7 px noise and a fifth of outliers."""
+    pixels, points, camera = [], [], []
+    for index, rig_from_cam in enumerate(rig_from_cams):
+        xy = rng.uniform(0, (960, 640), (count, 2))
+        in_cam = np.column_stack([np.asarray(TRUE.cam_from_img(xy)), np.ones(count)])
+        in_cam *= rng.uniform(*depth, (count, 1))
+        xy += rng.normal(0, 0.7, xy.shape)
+        xy[: count // 5] = rng.uniform(0, (960, 640), (count // 5, 2))
+        pixels.append(xy)
+        points.append(geometry.transform(rig_from_cam, in_cam))
+        camera.append(np.full(count, index))
+    matches = Matches(np.concatenate(camera), np.concatenate(pixels), np.arange(count * len(rig_from_cams)))
+    return matches, np.concatenate(points)
+
+
+def judged(
+    cameras: list[pycolmap.Camera],
+    seed: int = 0,
+    count: int = 300,
+    depth: tuple[float, float] = (4.0, 15.0),
+    rig_from_cams: Floats | None = None,
+) -> tuple[Misfit | None, Floats]:
+    """Return what is said of cameras, and the pose found with them: the true one is the identity."""
+    rig_from_cams = np.stack([np.eye(4), TURNED])[: len(cameras)] if rig_from_cams is None else rig_from_cams
+    matches, points = scene(np.random.default_rng(seed), rig_from_cams, count, depth)
+    query = RigQuery(cameras, rig_from_cams, [[] for _ in cameras])
+    inliers = matches[query.errors_deg(np.eye(4), matches, points) < 3]
+    pose = query.refine(np.eye(4), inliers, points)
+    assert pose is not None
+    return find_misfit(query, pose, matches, points, MAX_ERROR_DEG), pose
+
+
+@pytest.mark.parametrize("factor", [0.6, 0.75, 0.9, 0.98, 1.02, 1.1, 1.37])
+def test_a_wrong_focal_length_is_found_with_the_one_that_fits(factor: float) -> None:
+    camera = changed(factor)
+    misfit, pose = judged([camera])
+    assert misfit is not None
+    assert misfit.doubtful
+    assert misfit.focals_px([camera]) == pytest.approx([925], rel=0.004)
+    assert "the focal length that fits is 92" in misfit.reason([camera])
+    # The shift leads from the pose with the wrong focal length to the true one.
+    off_m = np.linalg.norm(geometry.invert(pose)[:3, 3])
+    assert np.linalg.norm(misfit.shift[3:]) == pytest.approx(off_m, abs=0.03)
+
+
+def test_a_wrong_principal_point_and_a_distortion_left_out_are_no_focal_length() -> None:
+    for camera, says in ((changed(x=0.03), "principal point that fits is 48"), (changed(k1=0.1), "radial distortion")):
+        misfit, _ = judged([camera])
+        assert misfit is not None
+        assert misfit.doubtful
+        assert np.isnan(misfit.focals_px([camera])).all()
+        assert says in misfit.reason([camera])
+
+
+def test_noise_does_not_look_like_a_wrong_camera() -> None:
+    """Of 300 right cameras, with few matches and with many, none is doubted."""
+    said = [judged([TRUE], seed, count)[0] for seed in range(100) for count in (20, 60, 300)]
+    assert [misfit for misfit in said if misfit is not None] == []
+
+
+def test_a_plane_that_faces_the_camera_says_nothing_of_the_focal_length() -> None:
+    misfit, pose = judged([changed(1.1)], depth=(8.0, 8.0))
+    assert misfit is None
+    assert abs(geometry.invert(pose)[2, 3]) > 0.5, "the distance makes up for it"
+
+
+def test_of_a_rig_the_wrong_camera_is_named() -> None:
+    cameras = [TRUE, changed(0.9)]
+    misfit, _ = judged(cameras)
+    assert misfit is not None
+    right, wrong = misfit.focals_px(cameras)
+    assert np.isnan(right)
+    assert wrong == pytest.approx(925, rel=0.004)
+    assert misfit.reason(cameras).startswith("camera 2 of 2: ")
+
+
+def test_all_cameras_of_a_rig_may_be_wrong() -> None:
+    cameras = [changed(0.9), changed(0.9)]
+    misfit, _ = judged(cameras)
+    assert misfit is not None
+    assert misfit.focals_px(cameras) == pytest.approx([925, 925], rel=0.004)
+
+
+def test_a_small_misfit_is_significant_but_no_reason_to_doubt() -> None:
+    misfit, _ = judged([changed(x=0.02)], count=3000)
+    assert misfit is not None
+    assert 0 < misfit.shares.max() == misfit.shares[0, 1] < MAX_SHARES[1]
+    assert not misfit.doubtful
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.2, 0.33, 3.0, 5.0, 10.0])
+def test_an_absurd_focal_length_is_found_from_the_pose_that_it_gave(factor: float) -> None:
+    """RANSAC finds some pose with it, from which no fit begins."""
+    camera = changed(factor)
+    matches, points = scene(np.random.default_rng(1), np.eye(4)[None], 300, (4.0, 15.0))
+    query = RigQuery([camera], np.eye(4)[None], [[]])
+    pose = query.ransac(matches, points, MAX_ERROR_DEG, seed=0, max_trials=1000)
+    assert pose is not None
+    misfit = find_misfit(query, pose, matches, points, MAX_ERROR_DEG)
+    assert misfit is not None
+    assert misfit.doubtful
+    assert misfit.focals_px([camera]) == pytest.approx([925], rel=0.01)
+
+
+@pytest.mark.parametrize("camera", [changed(x=-0.5), changed(k1=-44.0), changed(k1=5.0)], ids=["center", "fold", "k1"])
+def test_other_absurd_intrinsics_are_doubted(camera: pycolmap.Camera) -> None:
+    matches, points = scene(np.random.default_rng(1), np.eye(4)[None], 300, (4.0, 15.0))
+    query = RigQuery([camera], np.eye(4)[None], [[]])
+    pose = query.ransac(matches, points, MAX_ERROR_DEG, seed=0)
+    misfit = None if pose is None else find_misfit(query, pose, matches, points, MAX_ERROR_DEG)
+    assert pose is None or (misfit is not None and misfit.doubtful)
+
+
+def test_errors_that_neighbors_share_do_not_look_like_a_wrong_camera() -> None:
+    """A rolling shutter moves each row of the image by another amount: for a moment, it looks like other intrinsics."""
+    doubted = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        matches, points = scene(rng, np.eye(4)[None], 400, (4.0, 15.0))
+        phase, pixels = rng.uniform(0, 6, 2), matches.pixels
+        shift = 2 * np.sin(pixels[:, 1:] / 200 + phase)  # 2 px, with a period of twice the height
+        shaken = Matches(matches.camera, pixels + shift, matches.point)
+        query = RigQuery([TRUE], np.eye(4)[None], [[]])
+        pose = query.refine(np.eye(4), shaken[query.errors_deg(np.eye(4), shaken, points) < 3], points)
+        misfit = find_misfit(query, pose, shaken, points, MAX_ERROR_DEG)
+        doubted += misfit is not None and misfit.doubtful
+    assert doubted == 0
+
+
+def test_noise_of_the_poses_of_the_map_is_not_blamed_on_the_camera() -> None:
+    camera, rig = changed(x=0.03), np.eye(4)[None]
+    matches, points = scene(np.random.default_rng(0), rig, 300, (4.0, 15.0))
+    query = RigQuery([camera], rig, [[]])
+    pose = query.refine(np.eye(4), matches[query.errors_deg(np.eye(4), matches, points) < 3], points)
+    assert find_misfit(query, pose, matches, points, MAX_ERROR_DEG) is not None
+    assert find_misfit(query, pose, matches, points, MAX_ERROR_DEG, noise_deg=2.0) is None

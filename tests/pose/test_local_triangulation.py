@@ -1,0 +1,320 @@
+"""Points made for one query, and asking for more features only where a pose is not sure."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+from numpy.typing import NDArray
+
+from tests.queries import query_of
+from toolkit import geometry
+from toolkit.features.features import LocalFeatures
+from toolkit.features.matching import LocalMethod, Matcher, MutualMatcher, PairMatches
+from toolkit.mapping.local_map import LocalMap
+from toolkit.pose.base import PoseEstimate, Prior, Query, References
+from toolkit.pose.correspondences import Rival
+from toolkit.pose.escalation import EscalatingLocalizer
+from toolkit.pose.local_triangulation import OnDemandLocalizer, PosedImages
+from toolkit.pose.map_matching import MappedFeatures
+
+Floats = NDArray[np.float64]
+SIZE = (640, 480)
+POINTS = 300
+CAMERA = pycolmap.Camera(model="PINHOLE", width=SIZE[0], height=SIZE[1], params=[500, 500, 320, 240])
+
+
+def view_from(place: Sequence[float]) -> Floats:
+    """Return world_from_cam of a camera that looks at the origin, 5 m in front of it."""
+    forward = geometry.unit(-np.array(place, np.float64))
+    right = geometry.unit(np.cross([0.0, 1.0, 0.0], forward))
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = place
+    return pose
+
+
+MAP_POSES = np.stack([view_from((x, y, -5.0)) for x in (-1.2, 0.0, 1.2) for y in (-0.5, 0.5)])
+QUERY_POSE = view_from((0.4, 0.1, -4.5))
+
+
+class ByPoint:
+    """Matches features that are of the same point, whatever their descriptors; some wrongly if asked to."""
+
+    batch_size = 1
+    settings = {"name": "by point"}  # noqa: RUF012
+
+    def __init__(self, wrong: float = 0.0) -> None:
+        self.wrong = wrong
+
+    def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
+        rng, found = np.random.default_rng(0), []
+        for a, b in pairs:  # the score of a feature is the number of its point
+            _, first, second = np.intersect1d(a.scores, b.scores, return_indices=True)
+            bad = rng.uniform(size=len(second)) < self.wrong
+            second[bad] = rng.permutation(second[bad])
+            found.append(PairMatches(np.column_stack([first, second]), np.ones(len(first), np.float32)))
+        return found
+
+
+class Scene:
+    """Points in a box, seen by map cameras and by a query camera."""
+
+    def __init__(self, alike: bool = True, length: int = 128) -> None:
+        """`alike`: a point has the same descriptor in all map images; `length`: of the descriptors."""
+        rng = np.random.default_rng(1)
+        self.points = rng.uniform((-1.5, -1, -1), (1.5, 1, 1), (POINTS, 3))
+        self.names = [f"ios_map/raw_data/{index}.jpg" for index in range(len(MAP_POSES))]
+        common = rng.normal(size=(POINTS, length))
+        self.features = {
+            name: self._seen(pose, common if alike else rng.normal(size=(POINTS, length)), rng)
+            for name, pose in zip(self.names, MAP_POSES, strict=True)
+        }
+        self.query = query_of([CAMERA], np.eye(4)[None], [self._seen(QUERY_POSE, common, rng)])
+        self.references = [References.of(range(len(MAP_POSES)))]
+
+    def _seen(self, world_from_cam: Floats, descriptors: Floats, rng: np.random.Generator) -> LocalFeatures:
+        pixels = CAMERA.img_from_cam(geometry.transform(geometry.invert(world_from_cam), self.points))
+        order = rng.permutation(POINTS)
+        return LocalFeatures(
+            (pixels + rng.normal(0, 0.3, pixels.shape))[order].astype(np.float32),
+            np.ones(POINTS, np.float32),
+            order.astype(np.float32),
+            geometry.unit(descriptors)[order].astype(np.float16),
+            SIZE,
+        )
+
+    def mapped(self, images: Sequence[int], name: str = "sift", far: int = 0) -> MappedFeatures:
+        """Return the map of some of the images, whose first points, far away, none of them sees."""
+        names, count = [self.names[image] for image in images], far + POINTS
+        whole = LocalMap(
+            image_names=names,
+            cameras=[CAMERA] * len(names),
+            world_from_cams=MAP_POSES[list(images)],
+            points=np.concatenate([np.full((far, 3), 100.0), self.points]),
+            colors=np.zeros((count, 3), np.uint8),
+            obs_image=np.repeat(np.arange(len(names)), POINTS),
+            obs_keypoint=np.concatenate([np.argsort(self.features[name].scores) for name in names]),
+            obs_point=np.tile(np.arange(far, count), len(names)),
+            noise_px=np.full(count, 0.3, np.float32),
+        )
+        return MappedFeatures(whole, self.features, matcher=ByPoint(), name=name)
+
+    def localizer(
+        self,
+        mapped: Sequence[MappedFeatures] = (),
+        source: Callable[[str], LocalFeatures] | None = None,
+        instants: Sequence[int] = range(len(MAP_POSES)),
+        wrong: float = 0.0,
+        matcher: Matcher | None = None,
+    ) -> OnDemandLocalizer:
+        cameras = [CAMERA] * len(self.names)
+        names = list(mapped[0].map.image_names) if mapped else self.names
+        posed = PosedImages(names, cameras, MAP_POSES, np.array(instants))
+        method: Any = LocalMethod("aliked", SimpleNamespace(), matcher or ByPoint(wrong))
+        return OnDemandLocalizer(posed, mapped, [(method, source or self.features.__getitem__)])
+
+
+def assert_right(estimate: PoseEstimate, most_m: float = 0.01) -> None:
+    assert estimate.world_from_rig is not None, estimate.status
+    rotation_deg, distance_m = geometry.pose_error(estimate.world_from_rig, QUERY_POSE)
+    assert rotation_deg < 0.1
+    assert distance_m < most_m
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_no_map_is_needed(alike: bool) -> None:
+    """Where map images have nothing alike along epipolar lines, what the query shows of them makes the points."""
+    scene = Scene(alike)
+    estimate = scene.localizer().localize(scene.query, scene.references)
+    assert estimate.status == "ok"
+    assert_right(estimate)
+    assert len(np.unique(estimate.correspondences.points, axis=0)) > 0.9 * POINTS
+    assert set(estimate.correspondences.point_index) == {-1}, "they are in no file"
+    assert {name.split("/")[0] for name in estimate.correspondences.found_by} == {"aliked"}
+    assert set(estimate.references) <= set(range(len(MAP_POSES)))
+
+
+def test_wrong_matches_make_no_points() -> None:
+    """A third of the query's matches are wrong; two wrong ones that agree with the map's poses are rare."""
+    scene = Scene(alike=False)
+    estimate = scene.localizer(wrong=0.33).localize(scene.query, scene.references)
+    assert_right(estimate, 0.02)
+    used = estimate.correspondences
+    distances = np.linalg.norm(scene.points - used.points[used.inlier][:, None], axis=2).min(axis=1)
+    assert np.mean(distances < 0.05) > 0.95
+
+
+def test_the_cameras_of_a_rig_make_no_points_together() -> None:
+    scene = Scene()
+    estimate = scene.localizer(instants=[7] * len(MAP_POSES)).localize(scene.query, scene.references)
+    assert estimate.status == "failed: too few matches"
+
+
+@pytest.mark.parametrize("length", [128, 256])
+def test_a_reference_without_features_is_left_out(length: int) -> None:
+    """Its descriptors have another type, and another length than those of SuperPoint."""
+    scene = Scene(length=length)
+
+    def source(name: str) -> LocalFeatures:
+        return LocalFeatures.none(SIZE) if name == scene.names[0] else scene.features[name]
+
+    localizer = scene.localizer(source=source, matcher=MutualMatcher())
+    assert_right(localizer.localize(scene.query, scene.references))
+
+
+def test_matches_from_a_file_lack_what_could_not_be_read() -> None:
+    scene = Scene()
+    pairs = {
+        name: ByPoint().match([(scene.query.features[0][0], scene.features[name])])[0]  # type: ignore[list-item]
+        for name in scene.names[1:]
+    }
+
+    def source(name: str) -> LocalFeatures:
+        return scene.features[name] if name in pairs else LocalFeatures.none(SIZE)
+
+    query = replace(scene.query, network_matches=[[pairs.__getitem__]])
+    assert_right(scene.localizer(source=source).localize(query, scene.references))
+
+
+def test_without_references_there_is_no_pose() -> None:
+    scene = Scene()
+    assert scene.localizer().localize(scene.query, [References.of([])]).status == "failed: no references"
+
+
+def test_references_of_one_query_image_only() -> None:
+    """A rig whose second image has no references, and whose third cannot be read."""
+    scene = Scene()
+    features = scene.query.features[0]
+    rig = query_of([CAMERA] * 3, np.stack([np.eye(4)] * 3), [features, features, "no such file"])
+    nothing = References.of([])
+    estimate = scene.localizer().localize(rig, [scene.references[0], nothing, scene.references[0]])
+    assert_right(estimate)
+    assert set(estimate.correspondences.camera) <= {0, 1}
+
+
+def test_points_of_the_map_keep_their_index() -> None:
+    """The map has points that the references do not see; those that they see are named as in the whole map."""
+    scene = Scene()
+    mapped = scene.mapped(range(len(MAP_POSES)), far=50)
+    whole = mapped.map
+    both = replace(scene.query, features=[[*scene.query.features[0], *scene.query.features[0]]])
+    estimate = scene.localizer([mapped]).localize(both, scene.references)
+    assert_right(estimate)
+    index = estimate.correspondences.point_index
+    kinds = np.array([name.split("/")[0] for name in estimate.correspondences.found_by])
+    assert set(index[kinds == "aliked"]) == {-1}
+    np.testing.assert_array_equal(
+        whole.points[index[kinds == "sift"]], estimate.correspondences.points[kinds == "sift"]
+    )
+    assert (kinds == "sift").sum() > 200
+
+
+@pytest.mark.parametrize(("references", "of_second"), [([4, 5], True), ([0, 1], False)])
+def test_a_kind_may_have_other_images(references: list[int], of_second: bool) -> None:
+    """Only the last two images have features of the second kind."""
+    scene = Scene()
+    mapped = [scene.mapped(range(len(MAP_POSES))), scene.mapped([4, 5], "superpoint")]
+    query = replace(scene.query, features=[scene.query.features[0] * 3])  # type: ignore[list-item]
+    estimate = scene.localizer(mapped).localize(query, [References.of(references)])
+    assert_right(estimate)
+    used = estimate.correspondences
+    kinds = np.array([name.split("/")[0] for name in used.found_by])
+    assert set(kinds) == {"sift", "aliked"} | ({"superpoint"} if of_second else set())
+    for number, kind in enumerate(["sift", "superpoint"]):
+        index = used.point_index[kinds == kind] - number * POINTS
+        np.testing.assert_array_equal(scene.points[index], used.points[kinds == kind])
+
+
+class Scripted:
+    """A localizer that answers what it was told, and keeps what it was asked."""
+
+    batch_size = 1
+    image_names = ("a",)
+
+    def __init__(self, *answers: PoseEstimate) -> None:
+        self.answers, self.asked, self.priors = list(answers), list[Query](), list[Prior]()
+
+    def localize(
+        self, query: Query, references: Sequence[References], prediction: Any = None, priors: Sequence[Prior] = ()
+    ) -> PoseEstimate:
+        self.asked.append(query)
+        self.priors += priors
+        return self.answers.pop(0)
+
+
+def nothing_near(world_from_rig: NDArray[np.float64]) -> NDArray[np.int64]:
+    return np.zeros(0, np.int64)
+
+
+OK, LOW = PoseEstimate("ok", np.eye(4)), PoseEstimate("low_confidence", np.eye(4))
+VAGUE = replace(OK, covariance=np.eye(6))
+FAILED = PoseEstimate("failed: no consistent pose")
+DOUBTED = PoseEstimate("low_confidence: camera?", np.eye(4), misfit=True)
+SLIGHT = replace(VAGUE, misfit=True)  # a misfit that shows in the covariance alone
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "status", "found_by"),
+    [
+        (OK, None, "ok", "pnp"),
+        (DOUBTED, None, "low_confidence: camera?", "pnp"),
+        (SLIGHT, None, "ok", "pnp"),
+        (FAILED, DOUBTED, "low_confidence: camera?", "pnp+sift"),
+        (LOW, OK, "ok", "pnp+sift"),
+        (FAILED, OK, "ok", "pnp+sift"),
+        (LOW, LOW, "low_confidence", "pnp+sift"),
+        (LOW, FAILED, "low_confidence", "pnp"),
+        (VAGUE, OK, "ok", "pnp+sift"),
+        (VAGUE, LOW, "ok", "pnp"),
+        (FAILED, FAILED, "failed: no consistent pose", "pnp"),
+    ],
+)
+def test_more_features_are_asked_where_a_pose_is_not_sure(
+    first: PoseEstimate, second: PoseEstimate | None, status: str, found_by: str
+) -> None:
+    scene = Scene()
+    extracted: list[NDArray[np.uint8]] = []
+
+    def extract(images: Sequence[NDArray[np.uint8]]) -> list[LocalFeatures]:
+        extracted.extend(images)
+        return [scene.features[scene.names[0]]] * len(images)
+
+    extractor = SimpleNamespace(extract=extract, color=False)
+    further = Scripted(*([] if second is None else [second]))
+    kind: Any = SimpleNamespace(name="sift", extractor=extractor)
+    localizer: Any = EscalatingLocalizer(Scripted(first), further, [kind], 0.05, nothing_near)  # type: ignore[arg-type]
+    estimate = localizer.localize(scene.query, scene.references)
+    assert (estimate.status, estimate.found_by) == (status, found_by)
+    assert len(extracted) == len(further.asked) == (second is not None)
+    if further.asked:
+        assert [len(kinds) for kinds in further.asked[0].features] == [2]
+
+
+def test_what_the_first_attempt_knew_of_rivals_is_judged_by_all_features() -> None:
+    """More features once turned a wrong pose into ok, as they had forgotten the rival that SIFT knew."""
+    scene, there, far = Scene(), np.eye(4), np.eye(4)
+    there[0, 3], far[0, 3] = 28.0, 900.0
+    first = replace(LOW, rivals=(Rival(there, 0.9), Rival(far, 0.3)))
+    extractor = SimpleNamespace(extract=lambda images: [scene.features[scene.names[0]]] * len(images), color=False)
+    further, kind = Scripted(OK), SimpleNamespace(name="sift", extractor=extractor)
+    near = {0.0: [0, 1], 28.0: [5], 900.0: []}
+    localizer: Any = EscalatingLocalizer(
+        Scripted(first), further, [kind], 0.05, lambda pose: np.array(near[pose[0, 3]], np.int64)  # type: ignore[arg-type]
+    )
+    localizer.localize(scene.query, scene.references)
+    assert [(prior.world_from_rig[0, 3], prior.images.tolist()) for prior in further.priors] == [(0, [0, 1]), (28, [5])]
+
+
+@pytest.mark.parametrize("lacks", ["references", "readable image"])
+def test_a_query_that_nothing_can_help_is_not_asked_again(lacks: str) -> None:
+    scene = Scene()
+    query = scene.query if lacks == "references" else replace(scene.query, features=["no image"])
+    references = [References.of([])] if lacks == "references" else scene.references
+    first, further = Scripted(FAILED), Scripted()
+    localizer: Any = EscalatingLocalizer(first, further, [], 0.05, nothing_near)  # type: ignore[arg-type]
+    assert localizer.localize(query, references) is FAILED
+    assert not further.asked

@@ -1,0 +1,521 @@
+"""Align predicted cameras to the map by a similarity, and estimate its uncertainty.
+
+A network predicts the cameras of a query image and of its references in a frame `model` of unknown scale. The poses of
+the references in the map are known. The prediction is noisy; the map is taken as exact. Therefore:
+
+- Rotation comes from orientations, which are never degenerate, and from long baselines.
+- Scale is regressed from map to model. The other direction, that of Umeyama (1991), divides by the spread of noisy
+  centers, so its scale shrinks if the noise is as large as the baselines (errors in variables; Fuller 1987).
+- Depth ratios, metric over predicted, give the scale without baselines.
+- The size of the noise is unknown. It has a broad prior and is estimated from the residuals.
+- A mixture model detects wrong references: a reference either has that noise, or lies anywhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from toolkit import geometry
+from toolkit.alignment.depth_scale import DepthRatios, DepthSamples, ScaleEstimate, combined_scale
+from toolkit.alignment.robust import (
+    NOISE_FACTOR,
+    AlignmentError,
+    Bools,
+    checked_weights,
+    listed,
+    nearest_rotation,
+    noise_variance,
+    rigid_poses,
+)
+from toolkit.geometry import Floats, Ints
+from toolkit.threads import fixed_sums
+
+OUTLIER_SHARE = 0.2  # expected share of wrong references
+WRONG_PLACE = 20.0  # least extent of the space of wrong centers, in multiples of the expected noise
+CENTER_NOISE_SHARE = 0.01  # noise over the typical distance of references: larger scenes are predicted less exactly
+_STARTS = 6  # number of best hypotheses that are refined
+_ROUNDS = 10
+_LOG_PEAK = 1.5 * np.log(2 * np.pi)  # log normalization of a Gaussian in three coordinates
+_LOG_SPHERE = np.log(8 * np.pi**2)  # log volume of all rotations, measured as rotation vectors near the identity
+_UNKNOWN: dict[str, Any] = {
+    "scale_std": np.inf,
+    "rotation_std_deg": np.inf,
+    "rotation_covariance": np.diag(np.full(3, np.inf)),
+    "centroid_covariance": np.diag(np.full(3, np.inf)),
+}
+
+
+@dataclass(frozen=True)
+class Sim3:
+    """A similarity, world = scale * rotation @ model + translation."""
+
+    scale: float
+    rotation: Floats
+    """(3, 3)"""
+    translation: Floats
+    """(3,), in units of the world"""
+
+    def transform(self, points: ArrayLike) -> Floats:
+        """Transform points (..., 3) from the model to the world."""
+        return self.scale * np.asarray(points, np.float64) @ self.rotation.T + self.translation
+
+    def apply_to_pose(self, model_from_cam: ArrayLike) -> Floats:
+        """Return world_from_cam (..., 4, 4) of cameras (..., 4, 4) in the model.
+
+        The scale applies to the camera center but not to the camera frame, so the pose stays rigid.
+        """
+        pose = np.asarray(model_from_cam, np.float64)
+        return geometry.make_pose(self.rotation @ pose[..., :3, :3], self.transform(pose[..., :3, 3]))
+
+    def inverse(self) -> Sim3:
+        """Return the similarity from the world to the model."""
+        return Sim3(1 / self.scale, self.rotation.T, -self.rotation.T @ self.translation / self.scale)
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Similarity from predicted cameras to the map, with its uncertainty.
+
+    Standard deviations are lengths of vectors: the root of the trace of a covariance.
+    """
+
+    world_from_model: Sim3
+    """If the scale is unknown, `scale` is the most likely one, positive and finite, but not a measurement. The
+    centroids of the inliers coincide in any case."""
+    inliers: Bools
+    """(M,) references whose predicted relative poses agree with the map."""
+    scale_std: float
+    """Relative standard deviation of the scale; inf if unknown."""
+    rotation_std_deg: float
+    """Standard deviation of the rotation; inf if unknown."""
+    rmse_m: float
+    """Root mean square distance of the inliers' centers after alignment; NaN without inliers."""
+    reason: str
+    """What was left out or is unknown, and why; may be empty."""
+    num_rivals: int
+    """Largest number of excluded references that agree with each other on another alignment; 1 if none agree."""
+    centroid_m: Floats
+    """(3,) weighted centroid of the inliers in the world; rotation about it, scale and translation are uncorrelated."""
+    rotation_covariance: Floats
+    """(3, 3) of a small rotation in the world frame, radians."""
+    centroid_covariance: Floats
+    """(3, 3) of the position of the model's centroid in the world, square meters."""
+    rotation_noise_deg: float
+    """Estimated noise of a predicted orientation, the same for references and query."""
+    center_noise_m: float
+    """Estimated noise of a predicted center in meters, the same for references and query."""
+
+    @property
+    def scale_known(self) -> bool:
+        return bool(np.isfinite(self.scale_std))
+
+    @property
+    def num_inliers(self) -> int:
+        return int(self.inliers.sum())
+
+
+@fixed_sums
+def align_to_map(
+    model_from_cams: ArrayLike,
+    world_from_cams: ArrayLike,
+    weights: ArrayLike | None = None,
+    depth_ratios: DepthSamples | None = None,
+    *,
+    center_noise_m: float = 0.02,
+    rotation_noise_deg: float = 1.0,
+    max_scale_std: float = 0.2,
+) -> Alignment:
+    """Estimate the similarity from a predicted frame to the map, robustly.
+
+    The likelihood of each camera is a mixture: noise around its map pose, or a constant density for a wrong one.
+    Every reference and every pair of references gives a hypothesis, with the scale of the pair's baseline and again
+    with that of the depth ratios. Expectation maximization refines the most likely hypotheses and the noise. The best
+    one is returned.
+
+    Args:
+        model_from_cams: (M, 4, 4) predicted poses of the references. Poses that are not finite are left out.
+        world_from_cams: (M, 4, 4) their poses in the map, meters; left out likewise.
+        weights: (M,) relative confidence, 0 or more. The noise variance of a camera is proportional to 1 / weight; its
+            vote on which references are correct is proportional to weight. 0 leaves a reference out.
+        depth_ratios: metric over predicted depth of map points seen in references. Either one array (R,), or a list or
+            tuple of M arrays, one per reference. With one array per reference, samples of excluded references are not
+            used, and the error that the samples of a reference share adds to the uncertainty. Up to 40 % of the
+            samples may be wrong. Samples that are not finite or not positive are left out.
+        center_noise_m: expected noise of a predicted center, as a length. 1 % of the references' typical distance is
+            added, in squares. Within a small factor of it, and of `rotation_noise_deg`, the data decide.
+        rotation_noise_deg: expected noise of a predicted orientation, as an angle.
+        max_scale_std: a scale with a larger relative standard deviation counts as unknown.
+
+    Returns:
+        The alignment. Too few, coincident, collinear or contradicting references raise no error: unknown quantities get
+        an infinite standard deviation, and `reason` says why.
+
+    Raises:
+        AlignmentError: a shape is wrong, a matrix is not a rigid pose (the message gives its index), or a weight is
+            negative.
+    """
+    model, model_finite = rigid_poses(model_from_cams, "model_from_cams")
+    world, world_finite = rigid_poses(world_from_cams, "world_from_cams")
+    if len(model) != len(world):
+        raise AlignmentError(
+            f"Found {len(model)} model_from_cams and {len(world)} world_from_cams: expected equal numbers."
+        )
+    weight = checked_weights(weights, len(model))
+    ratios = DepthRatios.of(depth_ratios, len(model))
+    for name, value in (("center_noise_m", center_noise_m), ("rotation_noise_deg", rotation_noise_deg)):
+        if not (np.isfinite(value) and value > 0):
+            raise AlignmentError(f"{name} is {value}: expected a number above 0.")
+    finite = model_finite & world_finite
+    notes = [] if finite.all() else [f"references {listed(~finite)} left out: not finite"]
+    usable = np.flatnonzero(finite & (weight > 0))
+    if not len(usable):
+        return Alignment(
+            Sim3(1.0, np.eye(3), np.zeros(3)), np.zeros(len(model), bool), rmse_m=np.nan, num_rivals=0,
+            reason="; ".join([*notes, "no usable reference"]), centroid_m=np.zeros(3), rotation_noise_deg=np.inf,
+            center_noise_m=np.inf, **_UNKNOWN,
+        )  # fmt: skip
+    problem = _Problem(
+        model[usable], world[usable], weight[usable] / weight[usable].mean(), center_noise_m, rotation_noise_deg
+    )
+    depth = ratios.estimate(None)
+    best = problem.search(depth)
+    inliers, excluded = np.zeros(len(model), bool), np.zeros(len(model), bool)
+    inliers[usable], excluded[usable] = best.inliers, ~best.inliers
+    num_rivals, undecided = 0, []
+    if excluded.any():
+        notes.append(f"references {listed(excluded)} left out: their poses contradict the others'")
+        rest = problem.subset(~best.inliers)
+        # Excluded references agree with each other only within twice the noise of the inliers.
+        noise = best.state.with_noise(2.0)
+        rival = rest.search(depth, (float(noise.rotation_noise[0]), float(noise.center_noise[0])))
+        num_rivals = int(rival.inliers.sum())
+        if rest.weight[rival.inliers].sum() > 0.9 * problem.weight[best.inliers].sum():
+            counts = f"{inliers.sum()} references agree, and {num_rivals} others on another alignment"
+            undecided = [f"{counts}: undecided"]
+        if ratios.grouped:
+            depth = ratios.estimate(inliers)
+    notes += ratios.notes
+    alignment = replace(problem.solve(best, depth, max_scale_std, notes), inliers=inliers, num_rivals=num_rivals)
+    if undecided:
+        alignment = replace(alignment, reason="; ".join([*notes, *undecided]), **_UNKNOWN)
+    return alignment
+
+
+def query_pose(alignment: Alignment, model_from_query: ArrayLike) -> tuple[Floats, Floats]:
+    """Return the pose of a predicted camera in the map, world_from_query (4, 4), and its covariance (6, 6).
+
+    The covariance follows `pose.base.PoseEstimate`: it is that of d in world_from_cam @ Exp(d), rotation in
+    radians, then translation in meters. It adds three parts: the noise of the query's prediction (assumed equal to that
+    of the references), the uncertainty of the alignment's rotation and scale times the distance from the references'
+    centroid, and the uncertainty of the centroid. If the scale is unknown, its diagonal is infinite for the
+    translation; if the alignment is unknown, the whole diagonal is.
+
+    Args:
+        alignment: alignment of the references that were predicted together with the query.
+        model_from_query: (4, 4) predicted pose of the query in the same frame.
+
+    Raises:
+        AlignmentError: the pose is not rigid or not finite.
+    """
+    model, finite = rigid_poses(np.asarray(model_from_query, np.float64)[None], "model_from_query")
+    if not finite[0]:
+        raise AlignmentError("model_from_query is not finite: expected a rigid pose (4, 4).")
+    pose = alignment.world_from_model.apply_to_pose(model[0])
+    if not np.isfinite(alignment.rotation_std_deg):
+        return pose, np.diag(np.full(6, np.inf))
+    lever = pose[:3, 3] - alignment.centroid_m
+    # A rotation e of the model turns the query by e and moves it by e x lever.
+    moved = np.vstack([np.eye(3), np.cross(lever, np.eye(3))])
+    in_world = moved @ alignment.rotation_covariance @ moved.T
+    in_world[:3, :3] += np.eye(3) * np.radians(alignment.rotation_noise_deg) ** 2 / 3
+    if alignment.scale_known:
+        in_world[3:, 3:] += alignment.centroid_covariance + np.outer(lever, lever) * alignment.scale_std**2
+        in_world[3:, 3:] += np.eye(3) * alignment.center_noise_m**2 / 3
+    to_camera = np.kron(np.eye(2), pose[:3, :3].T)
+    covariance = to_camera @ in_world @ to_camera.T
+    if not alignment.scale_known:
+        covariance[3:] = covariance[:, 3:] = 0.0
+        covariance[3:, 3:] = np.diag(np.full(3, np.inf))
+    return pose, covariance
+
+
+def is_trustworthy(
+    alignment: Alignment,
+    covariance: Floats,
+    *,
+    max_position_std_m: float = 0.2,
+    max_rotation_std_deg: float = 2.25,
+    min_inliers: int = 2,
+    max_rival_share: float = 0.5,
+) -> bool:
+    """Tell whether a pose from `query_pose` is `ok`.
+
+    The defaults require that errors of 5 deg and 0.5 m are more than 2.2 standard deviations away (2.5 for the
+    position, whose error may lie along one axis), that references confirm each other, and that no large group of
+    references agrees on another alignment.
+
+    Args:
+        alignment: the alignment that the pose comes from.
+        covariance: (6, 6) of the pose, from `query_pose`.
+        max_position_std_m: limit for the root of the trace of the position covariance.
+        max_rotation_std_deg: limit for the root of the trace of the rotation covariance.
+        min_inliers: least number of consistent references; a single one is not checked by anything.
+        max_rival_share: limit for the size of the largest group of 2 or more excluded references that agree on another
+            alignment, divided by the number of inliers.
+    """
+    rivals = alignment.num_rivals if alignment.num_rivals > 1 else 0
+    return bool(
+        alignment.scale_known
+        and alignment.num_inliers >= min_inliers
+        and rivals <= max_rival_share * alignment.num_inliers
+        and np.sqrt(np.trace(covariance[3:, 3:])) <= max_position_std_m
+        and np.degrees(np.sqrt(np.trace(covariance[:3, :3]))) <= max_rotation_std_deg
+    )
+
+
+class _Problem:
+    """The M references in both frames.
+
+    K hypotheses are processed at once. Their members (K, M) are the probabilities that each reference is correct.
+    """
+
+    def __init__(self, model: Floats, world: Floats, weight: Floats, center_noise_m: float, rotation_noise_deg: float):
+        self.weight = weight
+        self.expected = (center_noise_m, rotation_noise_deg)
+        self.world_from_model = world[:, :3, :3] @ np.swapaxes(model[:, :3, :3], -1, -2)  # rotation from each camera
+        self.flat_rotations = self.world_from_model.reshape(-1, 9)
+        self.model, self.world = model, world
+        # Centers in the model (m) and in the world (c), relative to a middle reference: large coordinates lose digits.
+        self.origin_m, self.origin_c = _middle(model[:, :3, 3]), _middle(world[:, :3, 3])
+        self.m, self.c = model[:, :3, 3] - self.origin_m, world[:, :3, 3] - self.origin_c
+        # Flat, so that a sum over references is a matrix product with members.
+        self.outer_cm = (self.c[:, :, None] * self.m[:, None, :]).reshape(-1, 9)
+        typical = np.median(np.linalg.norm(self.c, axis=1))
+        # Noise per axis; three axes make the length.
+        self.center_prior = float(np.hypot(center_noise_m, CENTER_NOISE_SHARE * typical) / np.sqrt(3))
+        self.rotation_prior = float(np.radians(rotation_noise_deg) / np.sqrt(3))
+        first, second = np.triu_indices(len(self.m), 1)
+        gaps_m, gaps_c = (((x[first] - x[second]) ** 2).sum(axis=1) for x in (self.m, self.c))
+        # Extent of the references in the model; wrong cameras lie in a space of about this size.
+        self.extent = float(np.sqrt(np.mean(gaps_m))) if len(first) else 0.0
+        apart = gaps_m > 1e-18 * max(self.extent**2, 1e-300)
+        ratios = np.sqrt((gaps_c[apart] + 6 * self.center_prior**2) / gaps_m[apart])
+        # Scale to use where the centers do not determine it.
+        self.rough_scale = float(np.median(ratios)) if apart.any() else 1.0
+
+    def subset(self, kept: Bools) -> _Problem:
+        return _Problem(self.model[kept], self.world[kept], self.weight[kept], *self.expected)
+
+    def search(self, depth: ScaleEstimate | None, noise: tuple[float, float] | None = None) -> _Candidate:
+        """Return the most likely similarity and its inliers; `noise` (rotation, center) fixes the noise per axis."""
+        alone, (first, second) = np.eye(len(self.m)), np.triu_indices(len(self.m), 1)
+        members = np.vstack([alone[first] + alone[second], alone])
+        state = self.fit(members, self.opening(members), None)
+        if depth is not None:
+            state = state.joined(self.fit(members, self.opening(members), depth))
+        # A hypothesis from two noisy cameras fits the other ones less well than the noise suggests.
+        residuals = self.residuals(state)
+        scores = np.max([self.score(state.with_noise(factor), residuals)[0] for factor in (1.0, 3.0, 9.0)], axis=0)
+        state = state[np.argsort(-scores, kind="stable")[:_STARTS]].with_noise(3.0)
+        _, members = self.score(state, self.residuals(state))
+        for _ in range(_ROUNDS):
+            state = self.fit(members, state, depth)
+            residuals = self.residuals(state)
+            if noise is None:
+                state = state.with_noise_of(self, members, residuals)
+            else:
+                rotation_noise, center_noise = (np.full(len(state.scale), value) for value in noise)
+                state = replace(state, rotation_noise=rotation_noise, center_noise=center_noise)
+            before = members
+            scores, members = self.score(state, residuals)
+            best = int(np.argmax(scores))
+            if np.abs(members[best] - before[best]).max() < 1e-3:
+                break
+        inliers = members[best] > 0.5
+        if not inliers.any():
+            inliers[np.argmax(members[best])] = True
+        return _Candidate(state[best : best + 1], np.where(inliers, np.maximum(members[best], 0.5), 0.0), inliers)
+
+    def opening(self, members: Floats) -> _Similarities:
+        """Return starting points for the fit of members (K, M): their mean rotations, and the expected noise."""
+        count = len(members)
+        rotations = ((members * self.weight) @ self.flat_rotations).reshape(-1, 3, 3)
+        return _Similarities(
+            rotation=nearest_rotation(rotations),
+            scale=np.full(count, self.rough_scale),
+            mean_c=np.zeros((count, 3)),
+            mean_m=np.zeros((count, 3)),
+            rotation_noise=np.full(count, self.rotation_prior),
+            center_noise=np.full(count, self.center_prior),
+        )
+
+    def fit(self, members: Floats, last: _Similarities, depth: ScaleEstimate | None) -> _Similarities:
+        """Return the weighted least squares similarities (K) of members (K, M), given the noise per axis.
+
+        First the scale for the last rotation, then the rotation for that scale, each in closed form. The scale
+        maximizes s^D exp(-|c - s R m|^2 / (2 noise^2)), the likelihood of the model's centers over D coordinates. It
+        is unbiased, and positive for any data. The rotation combines orientations and baselines (Wahba 1965).
+        """
+        share = members * self.weight
+        total = np.maximum(share.sum(axis=1), 1e-12)[:, None]
+        mean_c, mean_m = share @ self.c / total, share @ self.m / total
+        variance = last.center_noise**2
+        cross = (share @ self.outer_cm).reshape(-1, 3, 3)
+        cross -= total[:, :, None] * mean_c[:, :, None] * mean_m[:, None, :]
+        square_m = ((self.m[None] - mean_m[:, None]) ** 2).sum(axis=2)
+        square_m = (share * square_m).sum(axis=1)
+        apart = (square_m > 1e-18 * self.extent**2) & (square_m > 1e-300)
+        room = variance * 3 * np.maximum(members.sum(axis=1) - 1, 1e-9)
+        along = (last.rotation * cross).sum(axis=(1, 2))
+        root = np.sqrt(along**2 + 4 * square_m * room)
+        # The positive root of square_m s^2 - along s - room, in the numerically stable form.
+        over = np.where(along > 0, along + root, 2 * room)
+        under = np.where(along > 0, 2 * square_m, root - along)
+        scale = over / np.where(apart, under, 1.0)
+        scale = np.where(apart, scale, depth.value if depth is not None else self.rough_scale)
+        if depth is not None:
+            square_c = (share * ((self.c[None] - mean_c[:, None]) ** 2).sum(axis=2)).sum(axis=1)
+            from_centers, from_depth = square_c / variance, 1 / max(depth.std, 1e-6) ** 2
+            part = from_centers / (from_centers + from_depth)
+            scale = np.exp(part * np.log(scale) + (1 - part) * np.log(depth.value))
+        rotations = (share @ self.flat_rotations).reshape(-1, 3, 3) / (last.rotation_noise**2)[:, None, None]
+        rotation = nearest_rotation(rotations + (2 * scale / variance)[:, None, None] * cross)
+        return _Similarities(rotation, scale, mean_c, mean_m, last.rotation_noise, last.center_noise)
+
+    def residuals(self, state: _Similarities) -> tuple[Floats, Floats]:
+        """Return squared angles (K, M) in radians and squared distances (K, M) in meters."""
+        trace = state.rotation.reshape(-1, 9) @ self.flat_rotations.T
+        moved = (self.m[None] - state.mean_m[:, None]) @ np.swapaxes(state.rotation, 1, 2) * state.scale[:, None, None]
+        distance = ((self.c[None] - state.mean_c[:, None] - moved) ** 2).sum(axis=2)
+        # 2 (1 - cos) of the angle, which is its square for small angles.
+        return np.maximum(3 - trace, 0), distance
+
+    def score(self, state: _Similarities, residuals: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
+        """Return the log likelihoods (K) and the probability (K, M) that each reference is correct."""
+        angle, distance = residuals
+        rotation_noise = state.rotation_noise[:, None] / np.sqrt(self.weight)
+        center_noise = state.center_noise[:, None] / np.sqrt(self.weight)
+        # The density of a wrong reference is constant over all rotations and over a space around the references. That
+        # space is the model's extent in meters: otherwise a scale near zero, which merges all centers, would win.
+        space = 3 * (state.scale * self.extent)[:, None] + WRONG_PLACE * self.center_prior
+        # Log likelihood ratios of noise over a constant density, for orientation and for position.
+        orientation = _LOG_SPHERE - _LOG_PEAK - 3 * np.log(rotation_noise) - angle / (2 * rotation_noise**2)
+        position = 3 * np.log(space / center_noise) - _LOG_PEAK - distance / (2 * center_noise**2)
+        right = np.log(1 - OUTLIER_SHARE) + orientation + position
+        # Wrong in both, or only in position, or only in orientation.
+        wrong = np.log(OUTLIER_SHARE / 3) + np.logaddexp(0.0, np.logaddexp(orientation, position))
+        either = np.logaddexp(right, wrong)
+        likelihood = either @ self.weight
+        for noise, expected in ((state.rotation_noise, self.rotation_prior), (state.center_noise, self.center_prior)):
+            likelihood = likelihood - (np.log(noise / expected) / NOISE_FACTOR) ** 2 / 2
+        return likelihood, np.exp(right - either)
+
+    def solve(self, best: _Candidate, depth: ScaleEstimate | None, max_scale_std: float, notes: list[str]) -> Alignment:
+        """Return the weighted least squares alignment of a candidate's inliers, with its uncertainty."""
+        state, share = best.state, best.members * self.weight
+        rotation, scale = state.rotation[0], float(state.scale[0])
+        rotation_noise, center_noise = float(state.rotation_noise[0]), float(state.center_noise[0])
+        count = float(best.members.sum())
+        c0, m0 = share @ self.c / share.sum(), share @ self.m / share.sum()
+        c, m = self.c - c0, self.m - m0
+        square_c = float(share @ (c**2).sum(axis=1))
+        lever = np.eye(3) * square_c - np.einsum("m,mi,mj->ij", share, c, c)  # information of baselines on rotation
+        rotations = np.einsum("m,mij->ij", share, self.world_from_model)
+        cross = np.einsum("m,mi,mj->ij", share, c, m)
+        for _ in range(4):
+            numbers = (np.array([value]) for value in (scale, c0, m0, rotation_noise, center_noise))
+            fitted = _Similarities(rotation[None], *numbers)
+            rotation = nearest_rotation(
+                (rotations / rotation_noise**2 + 2 * scale / center_noise**2 * cross)[None], keep=rotation
+            )[0]
+            estimate = combined_scale(float(np.sum(rotation * cross)), square_c, center_noise / scale, depth)
+            scale_std, conflict = (estimate.std, estimate.conflict) if estimate is not None else (np.inf, False)
+            if estimate is not None and scale_std <= max_scale_std:
+                scale = estimate.value
+            else:
+                scale = float(self.fit(best.members[None], fitted, depth).scale[0])
+            fitted = replace(fitted, rotation=rotation[None], scale=np.array([scale]))
+            angle, distance = (values[0] @ share for values in self.residuals(fitted))
+            # The rotation's degrees of freedom are split between orientations and baselines by information.
+            by_orientation, by_baselines = 3 * share.sum() / rotation_noise**2, np.trace(lever) / center_noise**2
+            part = by_orientation / (by_orientation + by_baselines)
+            free = (3 * count - 3 * part, 3 * (count - 1) - 3 * (1 - part) - float(square_c > 0))
+            rotation_noise = float(np.sqrt(noise_variance(angle, max(free[0], 0.0), self.rotation_prior)))
+            center_noise = float(np.sqrt(noise_variance(distance, max(free[1], 0.0), self.center_prior)))
+        known = scale_std <= max_scale_std
+        why = "baselines not above the noise of the centers, and no depth ratios"
+        if depth is not None:
+            why = "neither baselines nor depth ratios give it well enough"
+        notes = [
+            *notes,
+            *(["depth ratios and baselines contradict each other on the scale"] if conflict else []),
+            *([] if known else [f"scale unknown: {why}"]),
+        ]
+        translation = self.origin_c + c0 - scale * rotation @ (self.origin_m + m0)
+        covariance = np.linalg.inv(np.eye(3) * share.sum() / rotation_noise**2 + lever / center_noise**2)
+        squared_m2 = ((c - scale * m @ rotation.T) ** 2).sum(axis=1)
+        return Alignment(
+            world_from_model=Sim3(scale, rotation, translation),
+            inliers=best.inliers,
+            scale_std=scale_std if known else np.inf,
+            rotation_std_deg=float(np.degrees(np.sqrt(np.trace(covariance)))),
+            rmse_m=float(np.sqrt(squared_m2[best.inliers].mean())),
+            reason="; ".join(notes),
+            num_rivals=0,
+            centroid_m=self.origin_c + c0,
+            rotation_covariance=covariance,
+            centroid_covariance=np.eye(3) * center_noise**2 / share.sum(),
+            rotation_noise_deg=float(np.degrees(rotation_noise) * np.sqrt(3)),
+            center_noise_m=float(center_noise * np.sqrt(3)),
+        )
+
+
+@dataclass(frozen=True)
+class _Similarities:
+    """K similarities world = scale R (model - mean_m) + mean_c, with their noise per axis."""
+
+    rotation: Floats
+    scale: Floats
+    mean_c: Floats
+    mean_m: Floats
+    rotation_noise: Floats
+    center_noise: Floats
+
+    def __getitem__(self, index: Ints | slice) -> _Similarities:
+        return _Similarities(**{name: part[index] for name, part in vars(self).items()})
+
+    def joined(self, other: _Similarities) -> _Similarities:
+        parts = vars(other)
+        return _Similarities(**{name: np.concatenate([part, parts[name]]) for name, part in vars(self).items()})
+
+    def with_noise(self, factor: float) -> _Similarities:
+        return replace(self, rotation_noise=self.rotation_noise * factor, center_noise=self.center_noise * factor)
+
+    def with_noise_of(self, problem: _Problem, members: Floats, residuals: tuple[Floats, Floats]) -> _Similarities:
+        angle, distance = ((members * values) @ problem.weight for values in residuals)
+        free = 3 * np.maximum(members.sum(axis=1) - 1, 0)
+        return replace(
+            self,
+            rotation_noise=np.sqrt(noise_variance(angle, free, problem.rotation_prior)),
+            center_noise=np.sqrt(noise_variance(distance, np.maximum(free - 1, 0), problem.center_prior)),
+        )
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """One similarity and its inliers."""
+
+    state: _Similarities
+    members: Floats
+    """(M,) probability that each reference is correct, 0 if left out."""
+    inliers: Bools
+
+
+def _middle(points: Floats) -> Floats:
+    """Return the one of the points (M, 3) with the least sum of distances to all of them."""
+    distances = np.sqrt(((points[:, None] - points[None]) ** 2).sum(axis=2))
+    return np.asarray(points[np.argmin(distances.sum(axis=1))], np.float64)

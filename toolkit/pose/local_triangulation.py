@@ -1,0 +1,239 @@
+"""Localize with points that are triangulated for each query from its references, without a map of such features.
+
+The poses of the references are known, so their features are matched along epipolar lines. In addition, if the same
+query keypoint matches in two references, their two keypoints match each other, provided that they agree with the poses.
+A network can match features with a dark query image that the search along epipolar lines does not match.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from threading import Lock
+from types import MappingProxyType
+
+import numpy as np
+import pycolmap
+
+from toolkit import geometry
+from toolkit.capture import Session
+from toolkit.capture.cameras import rays_of
+from toolkit.features.features import KINDS, FeatureKind, LocalFeatures
+from toolkit.features.matching import AnyMethod, PairMatches
+from toolkit.geometry import Floats, Ints
+from toolkit.manifest import MapSettings, PnpSettings
+from toolkit.mapping.build import MAX_EPIPOLAR_ERROR_PX, instants, match_pairs, select_pairs
+from toolkit.mapping.local_map import LocalMap
+from toolkit.mapping.triangulation import triangulate
+from toolkit.pose.base import NetworkMatches, PoseEstimate, Prior, Query, References, WithoutNetwork
+from toolkit.pose.map_matching import MappedFeatures
+from toolkit.pose.pnp import PnpLocalizer
+from toolkit.threads import fixed_sums
+
+FeatureSource = Callable[[str], LocalFeatures]
+"""Returns the features of a map image, given by name; no features if the image cannot be read."""
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """The N images of a map."""
+
+    names: list[str]
+    cameras: list[pycolmap.Camera]
+    world_from_cams: Floats
+    """(N, 4, 4)."""
+    instants: Ints
+    """(N,) equal numbers for images that one rig took at one instant; these are never paired."""
+
+    @classmethod
+    def of_session(
+        cls,
+        session: Session,
+        names: list[str] | None = None,
+        length: float = 1.0,
+        refined: Mapping[str, Floats] = MappingProxyType({}),
+    ) -> "PosedImages":
+        """Return images of a session.
+
+        Args:
+            session: the map session.
+            names: of the images; None: all images with a pose.
+            length: positions are divided by it.
+            refined: poses (4, 4) by image name, instead of those of the session.
+        """
+        if names is None:
+            rows = session.camera_rows
+            rows = rows[np.isfinite(session.world_from_cam(rows)).reshape(-1, 16).all(axis=1)]
+            names = [session.image_name(int(row)) for row in rows]
+        else:
+            rows = np.array([session.row_of_name[name] for name in names], np.int64)
+        poses = session.world_from_cam(rows)
+        poses = np.array([refined.get(name, pose) for name, pose in zip(names, poses, strict=True)]).reshape(-1, 4, 4)
+        poses[:, :3, 3] /= length
+        return cls(names, session.cameras(rows), poses, instants(session, rows))
+
+
+class OnDemandLocalizer(WithoutNetwork):
+    """Localizes with triangulated maps of some kinds of features, and for other kinds with points made for each query.
+
+    Safe to use from several threads.
+    """
+
+    def __init__(
+        self,
+        posed: PosedImages,
+        mapped: Sequence[MappedFeatures],
+        on_demand: Sequence[tuple[AnyMethod, FeatureSource]],
+        map_settings: MapSettings | None = None,
+        settings: PnpSettings | None = None,
+        seed: int = 0,
+    ) -> None:
+        """
+        Args:
+            posed: the images of all kinds, in the order of `LocalMap.pooled`.
+            mapped: kinds of features with triangulated points. Queries have features of these kinds first.
+            on_demand: kinds of features without points, which follow in the queries, and the source of map features.
+            map_settings: how points are triangulated.
+            settings, seed: as for `PnpLocalizer`.
+        """
+        self.posed, self.mapped, self.on_demand = posed, list(mapped), list(on_demand)
+        self._map_settings, self._settings = map_settings or MapSettings(), settings or PnpSettings()
+        self._seed = seed
+        self._network = Lock()
+        self.image_names = posed.names
+
+    @fixed_sums
+    def localize(
+        self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()
+    ) -> PoseEstimate:
+        """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`."""
+        images = np.unique(np.concatenate([np.zeros(0, np.int64), *(retrieved.images for retrieved in references)]))
+        names = [self.posed.names[index] for index in images]
+        mapped, point_index, first_point = [], [], 0
+        for whole in self.mapped:
+            index_of = whole.map.index_of  # a kind may lack images whose features could not be extracted
+            part, points = whole.map.around(np.array([index_of[name] for name in names if name in index_of], np.int64))
+            mapped.append(whole.with_map(part))
+            point_index.append(first_point + points)
+            first_point += len(whole.map.points)
+        network_matches = query.network_matches or [
+            [None] * (len(self.mapped) + len(self.on_demand)) for _ in query.views
+        ]
+        matches = [list(of_camera[: len(self.mapped)]) for of_camera in network_matches]
+        for number, (method, source) in enumerate(self.on_demand, start=len(self.mapped)):
+            features = {name: source(name) for name in names}
+            new_matches = self._match(query, references, features, method, number)
+            local_map = self.triangulate(images, features, new_matches, KINDS[method.name])
+            mapped.append(MappedFeatures(local_map, features, KINDS[method.name], method.matcher, method.name))
+            point_index.append(np.full(len(local_map.points), -1))  # these points are in no map file
+            for of_camera, of_kind in zip(matches, new_matches, strict=True):
+                of_camera.append(of_kind.__getitem__)
+        estimate = PnpLocalizer(mapped, self._settings, self._seed).localize(
+            replace(query, network_matches=matches), references, None, priors
+        )
+        used = estimate.correspondences
+        index = np.concatenate([np.zeros(0, np.int64), *point_index])[used.point_index]
+        return replace(estimate, correspondences=replace(used, point_index=index))
+
+    def _match(
+        self,
+        query: Query,
+        references: Sequence[References],
+        features: Mapping[str, LocalFeatures],
+        method: AnyMethod,
+        number: int,
+    ) -> list[dict[str, PairMatches]]:
+        """Return for each query image its matches with its references, by name, of the kind with the given number."""
+        pairs: list[tuple[int, str]] = []
+        to_match: list[tuple[LocalFeatures, LocalFeatures]] = []
+        matches: list[dict[str, PairMatches]] = [{} for _ in query.views]
+        for camera, (query_features, retrieved) in enumerate(zip(query.features, references, strict=True)):
+            names = [self.posed.names[index] for index in retrieved.images]
+            stored: NetworkMatches | None = query.network_matches[camera][number] if query.network_matches else None
+            if stored is not None:
+                # Matches with an unreadable reference are not stored.
+                matches[camera] = {name: stored(name) if len(features[name]) else PairMatches.none() for name in names}
+            elif not isinstance(query_features, str):
+                pairs += [(camera, name) for name in names]
+                to_match += [(query_features[number], features[name]) for name in names]
+        with self._network:
+            new_matches = method.matcher.match(to_match)
+        for (camera, name), pair_matches in zip(pairs, new_matches, strict=True):
+            matches[camera][name] = pair_matches
+        return matches
+
+    def triangulate(
+        self,
+        images: Ints,
+        features: Mapping[str, LocalFeatures],
+        query_matches: Sequence[Mapping[str, PairMatches]],
+        kind: FeatureKind,
+    ) -> LocalMap:
+        """Triangulate the points that some of the images see; return a map of all images with these points.
+
+        Args:
+            images: (n,) indices of these images, ascending.
+            features: their features, by name.
+            query_matches: for each query image, its matches with some of these images, by name.
+            kind: entry of the features in `KINDS`.
+        """
+        posed, settings = self.posed, self._map_settings
+        names = [posed.names[index] for index in images]
+        cameras, poses = [posed.cameras[index] for index in images], posed.world_from_cams[images]
+        loaded = [features[name] for name in names]
+        pairs = select_pairs(poses, cameras, posed.instants[images], settings.pairs_per_image)
+        along_lines = match_pairs(pairs, loaded.__getitem__, cameras, poses, kind=kind)
+        matches = {(int(i), int(j)): pair.indices for (i, j), pair in zip(pairs, along_lines, strict=True)}
+        number_of = {name: number for number, name in enumerate(names)}
+        for of_image in query_matches:
+            matched = sorted((number_of[name], pair.indices) for name, pair in of_image.items() if name in number_of)
+            for (i, with_i), (j, with_j) in combinations(matched, 2):
+                if posed.instants[images[i]] == posed.instants[images[j]]:
+                    continue
+                _, at_i, at_j = np.intersect1d(with_i[:, 0], with_j[:, 0], assume_unique=True, return_indices=True)
+                through_query = np.column_stack([with_i[at_i, 1], with_j[at_j, 1]])
+                errors = [
+                    _epipolar_errors_px(
+                        (cameras[a], cameras[b]),
+                        geometry.invert(poses[b]) @ poses[a],
+                        loaded[a].keypoints[through_query[:, first]],
+                        loaded[b].keypoints[through_query[:, 1 - first]],
+                    )
+                    for a, b, first in ((i, j, 0), (j, i, 1))
+                ]
+                earlier = matches.get((i, j), np.zeros((0, 2), np.int64))
+                # A keypoint has one partner in an image: the first one found.
+                new = np.max(errors, axis=0) < MAX_EPIPOLAR_ERROR_PX
+                new &= ~np.isin(through_query[:, 0], earlier[:, 0]) & ~np.isin(through_query[:, 1], earlier[:, 1])
+                matches[i, j] = np.concatenate([earlier, through_query[new]])
+        ordered = sorted(matches)
+        local_map = triangulate(
+            names,
+            cameras,
+            poses,
+            [image_features.keypoints for image_features in loaded],
+            np.array(ordered, np.int64).reshape(-1, 2),
+            [matches[pair] for pair in ordered],
+            settings,
+            self._seed,
+        )
+        return replace(
+            local_map,
+            image_names=posed.names,
+            cameras=posed.cameras,
+            world_from_cams=posed.world_from_cams,
+            obs_image=images[local_map.obs_image],
+        )
+
+
+def _epipolar_errors_px(
+    cameras: tuple[pycolmap.Camera, pycolmap.Camera], b_from_a: Floats, pixels_a: Floats, pixels_b: Floats
+) -> Floats:
+    """Return the distances (K,) of pixels (K, 2) of image b from the epipolar lines of pixels of image a, pixels.
+
+    They are inf if there is no baseline.
+    """
+    baseline = b_from_a[:3, 3]
+    normals = np.cross(baseline, rays_of(cameras[0], pixels_a) @ b_from_a[:3, :3].T)
+    lengths = np.linalg.norm(normals, axis=1)
+    sines = np.abs((normals * rays_of(cameras[1], pixels_b)).sum(axis=1)) / np.maximum(lengths, 1e-12)
+    return np.where(lengths > 1e-6, sines * cameras[1].mean_focal_length(), np.inf)

@@ -1,0 +1,28 @@
+"""The simplest method, for comparison: the query gets the pose of its best reference."""
+
+from collections.abc import Sequence
+
+from toolkit import geometry
+from toolkit.geometry import Floats
+from toolkit.pose.base import PoseEstimate, Prior, Query, References, WithoutNetwork
+
+
+class NearestLocalizer(WithoutNetwork):
+    """Gives the query image with the best retrieval score the pose of its first reference."""
+
+    def __init__(self, image_names: list[str], world_from_cams: Floats) -> None:
+        """`world_from_cams` (N, 4, 4) are the poses of the N map images."""
+        self.image_names = image_names
+        self.world_from_cams = world_from_cams
+
+    def localize(
+        self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()
+    ) -> PoseEstimate:
+        """Return the pose of the best reference, never `ok`; see `Localizer`."""
+        scores = [(float(best.scores[0]), camera) for camera, best in enumerate(references) if len(best.images)]
+        if not scores:
+            return PoseEstimate("failed: no references")
+        camera = max(scores)[1]
+        reference = int(references[camera].images[0])
+        world_from_rig = self.world_from_cams[reference] @ geometry.invert(query.rig_from_cams[camera])
+        return PoseEstimate("low_confidence", world_from_rig, references=(reference,), found_by="nearest")

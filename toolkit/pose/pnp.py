@@ -1,0 +1,479 @@
+"""Localize by matching a query's features to triangulated map points, and PnP for single cameras and rigs.
+
+It takes two steps:
+
+1. Match the query with its retrieved references by descriptors alone, and find a pose by LO-RANSAC.
+2. Project the points of all covisible map images into the query at this pose, and match them only with keypoints near
+   their projections (guided matches). This finds several times as many matches, and refines the pose.
+
+Several kinds of features can be used together: one pose is estimated from the pooled matches of all kinds.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from toolkit import geometry
+from toolkit.alignment.robust import Bools
+from toolkit.geometry import Floats, Ints
+from toolkit.manifest import PnpSettings
+from toolkit.pose.base import (
+    CAMERA,
+    NetworkMatches,
+    PoseEstimate,
+    Prior,
+    Query,
+    References,
+    WithoutNetwork,
+    agree,
+)
+from toolkit.pose.confidence import EVIDENCE, bounded_by_deviation, bounded_by_rivals, probability_right
+from toolkit.pose.correspondences import Correspondences, Rival
+from toolkit.pose.intrinsics_check import find_misfit
+from toolkit.pose.map_matching import MapMatcher, MappedFeatures, MatchCache, Vicinity
+from toolkit.pose.rig import Matches, RigQuery, least_squares_covariance
+from toolkit.threads import fixed_sums
+
+PNP_FORMAT = 5
+"""Version of the poses. Increase when the same settings and files give other poses."""
+FIRST_REFERENCES = {2: 200, 4: 100}
+"""Number of references per image to match first -> independent inliers that their pose needs to be kept. The next
+number, and finally all references, are matched if the pose has fewer, or if too few of the matches are inliers."""
+MIN_SHARED_POINTS = 12
+"""A map image that observes at least so many inliers shows their place, so it cannot be of a rival."""
+CLEAR_INLIER_RATIO = 0.56
+"""Above this share of inliers among the matches, no rival pose is searched: the remaining matches are usually too few
+to support one beyond `MAX_RIVAL_SUPPORT`."""
+CONTESTED_INLIER_RATIO = 0.4
+"""Below this share of inliers, the pose may mix two places: RANSAC runs again with the tighter `max_error_deg`, and
+separately for single references."""
+CONTESTED_REFERENCES = 4
+"""How many references, those with the most matches, then get a RANSAC of their own: several similar-looking places
+together can outvote the one reference that shows the right place."""
+MAX_RIVAL_SUPPORT = 0.8
+"""A pose is `ok` only if the best rival pose has at most this fraction of its support. With the default
+`ok_probability` the limit is 0.7, see `confidence.py`."""
+GUIDED_RADII_DEG = (0.7, 0.35)
+"""Guided matching: search radius around each projected map point, degrees; one pass per radius."""
+MAX_GUIDED_MATCHES = 1000
+"""Largest number of guided matches per camera; those with the most similar descriptors are kept."""
+RIVAL_SHARE = 0.25
+"""Smallest number of matches by descriptors that agree with a rival, as a share of those that agree with the pose. Such
+a rival may have most of the guided matches, as references of one place hide those of its double."""
+GUIDED_WEIGHT = 0.5
+"""Weight in the covariance of a match that only the search near the pose found. Errors over stated deviations then have
+medians of 0.7 (drone), 0.9, 1.4 (kitchen) and 1.0 (STRECHA); with 0: 0.2, 0.9, 1.1, 0.8; with 1: 0.9, 1.0, 1.6, 1.2."""
+VIEWS = 4
+"""Number of references whose keypoints are stored with the correspondences: those that observe the most of them."""
+
+
+@dataclass(frozen=True)
+class _Hypothesis:
+    """A pose and the matches that support it: guided matches, or those of RANSAC if guided matching finds too few."""
+
+    rig_from_world: Floats
+    matches: Matches
+    support: float
+    """Sum over the matches of 1 - (error / `max_error_deg`)^2, at least 0 each, as in MSAC (Torr and Zisserman, CVIU
+    2000). Guided matches are searched near the projections of the map, so a wrong pose near the right one may have as
+    many, but with larger errors."""
+
+    @property
+    def world_from_rig(self) -> Floats:
+        return geometry.invert(self.rig_from_world)
+
+
+class PnpLocalizer(WithoutNetwork):
+    """Localizes queries in one map by matching and PnP, with one or several kinds of features.
+
+    Safe to use from several threads; the map is never changed.
+    """
+
+    def __init__(self, mapped: Sequence[MappedFeatures], settings: PnpSettings | None = None, seed: int = 0):
+        self.seed = seed
+        consistency = mapped[0].map.consistency
+        self._noise_deg = consistency.direction_noise_deg
+        settings = settings or PnpSettings()
+        # Noise of the map's poses asks for a wider search.
+        limit = max(settings.max_error_deg, 1.5 * self._noise_deg)
+        self.settings = settings.model_copy(update={"max_error_deg": limit})
+        self._radii_deg = [max(radius, 3 * self._noise_deg) for radius in GUIDED_RADII_DEG]
+        stds = np.repeat([np.radians(consistency.rotation_noise_deg), consistency.position_noise], 3)
+        self._noise_of_poses = np.diag(stds**2)
+        """Covariance (6, 6) of a pose of the map. A query's pose is as far off as the map's poses around it are."""
+        self.matcher = MapMatcher(mapped)
+        self.map = self.matcher.map
+
+    @property
+    def image_names(self) -> list[str]:
+        return self.map.image_names
+
+    @fixed_sums
+    def localize(
+        self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()
+    ) -> PoseEstimate:
+        """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`.
+
+        Images without features are left out. A prior is one more hypothesis: it wins if it has clearly more
+        support. A prior that agrees with an `ok` pose changes nothing.
+        """
+        usable = [index for index, features in enumerate(query.features) if not isinstance(features, str)]
+        if len(usable) < len(query.features):
+            return self._localize_part(query, usable, references, priors)
+        if not any(len(retrieved.images) for retrieved in references):
+            return PoseEstimate("failed: no references")
+        rig = RigQuery(
+            [view.camera for view in query.views],
+            np.asarray(query.rig_from_cams, np.float64),
+            [features for features in query.features if not isinstance(features, str)],
+        )
+        matches, first_matches, start = self._first_pose(rig, references, query.network_matches)
+        hypotheses = [] if start is None else self._hypotheses(rig, start, first_matches, matches, references)
+        if hypotheses:
+            estimate = self._estimate(rig, matches, hypotheses, references)
+        else:
+            status = f"failed: {'no consistent pose' if len(np.unique(matches.point)) >= 4 else 'too few matches'}"
+            estimate = PoseEstimate(status, num_matches=len(matches), correspondences=self._rejected(matches))
+        for prior in priors:
+            estimate = self._compare(rig, matches, hypotheses, estimate, references, prior)
+        return self._with_misfit(rig, matches, estimate)
+
+    def _localize_part(
+        self, query: Query, usable: Sequence[int], references: Sequence[References], priors: Sequence[Prior]
+    ) -> PoseEstimate:
+        """Return the estimate from the images with features alone; `usable` are their indices."""
+        missing = "; ".join(features for features in query.features if isinstance(features, str))
+        if not usable:
+            return PoseEstimate(f"failed: no readable image ({missing})")
+        estimate = self.localize(query.part(usable), [references[index] for index in usable], None, priors)
+        used = replace(estimate.correspondences, camera=np.array(usable, np.int64)[estimate.correspondences.camera])
+        focals_px = np.full(len(query.features), np.nan)
+        focals_px[usable] = estimate.focals_px or np.nan
+        centers_px = np.full((len(query.features), 2), np.nan)
+        centers_px[usable] = np.array(estimate.centers_px).reshape(-1, 2) if estimate.centers_px else np.nan
+        reason = "; ".join(filter(None, [estimate.reason, missing]))
+        centers = tuple((x, y) for x, y in centers_px.tolist())
+        focals = tuple(focals_px.tolist())
+        return replace(estimate, correspondences=used, focals_px=focals, centers_px=centers, reason=reason)
+
+    def _with_misfit(self, query: RigQuery, matches: Matches, estimate: PoseEstimate) -> PoseEstimate:
+        """Return the estimate, with a warning if matches made without the pose contradict the query's intrinsics.
+
+        The pose remains that of the stated intrinsics. Its covariance grows to cover the pose of those that would fit.
+        """
+        if estimate.world_from_rig is None:
+            return estimate
+        misfit = find_misfit(
+            query,
+            geometry.invert(estimate.world_from_rig),
+            matches[self.map.track_lengths(matches.point) > 1],  # points with one observation are not triangulated
+            self.map.points,
+            self.settings.ransac_max_error_deg,
+            focal_alone=estimate.rival_support > MAX_RIVAL_SUPPORT,
+            noise_deg=self._noise_deg,
+        )
+        if misfit is None:
+            return estimate
+        covariance = estimate.covariance
+        wider = None if covariance is None else covariance + np.outer(misfit.shift, misfit.shift)
+        if not misfit.doubtful:
+            return replace(estimate, covariance=wider, misfit=True)
+        return replace(
+            estimate,
+            status=CAMERA,
+            covariance=wider,
+            misfit=True,
+            focals_px=misfit.focals_px(query.cameras),
+            centers_px=misfit.centers_px(query.cameras),
+            reason=misfit.reason(query.cameras),
+        )
+
+    def _compare(
+        self,
+        query: RigQuery,
+        matches: Matches,
+        hypotheses: list[_Hypothesis],
+        estimate: PoseEstimate,
+        references: Sequence[References],
+        prior: Prior,
+    ) -> PoseEstimate:
+        """Return the estimate found without a prior, or the one found from the prior if it is better supported."""
+        if estimate.status == "ok" and agree(estimate.world_from_rig, prior.world_from_rig):
+            return estimate  # each confirms the other
+        rig_from_world = geometry.invert(prior.world_from_rig)
+        vicinity = self.matcher.vicinity(query, rig_from_world, self._covisible(prior.images), prior.radius_deg)
+        near = vicinity.guided(rig_from_world, prior.radius_deg, MAX_GUIDED_MATCHES)
+        start = self._ransac(query, near, self.settings.ransac_max_error_deg) if len(near) else None
+        if start is None:
+            return estimate
+        hypothesis = self._improve(query, start, near)
+        same = bool(hypotheses) and not _differ(hypotheses[0], hypothesis)
+        support = hypotheses[0].support if hypotheses else 0.0
+        clearly_more = support <= MAX_RIVAL_SUPPORT * hypothesis.support  # a tie keeps the first estimate
+        as_much = hypothesis.support >= 0.99 * support  # found from two starts, one pose differs in the last digits
+        if (as_much and estimate.status != "ok") if same else clearly_more:
+            # The matches near the prior judge the pose: like matches by descriptors, they were made without it.
+            prior_references = [References.of(prior.images.tolist())]
+            with_prior = self._estimate(query, near, [hypothesis, *hypotheses], prior_references)
+            lost = estimate.world_from_rig is None
+            if with_prior.world_from_rig is not None and (not same or lost or with_prior.status == "ok"):
+                return replace(with_prior, found_by=f"pnp+{prior.source}")
+            return estimate
+        if same or estimate.world_from_rig is None:
+            return estimate
+        rivals = sorted([*hypotheses, hypothesis], key=lambda rival: -rival.support)
+        return self._estimate(query, matches, rivals, references)
+
+    def _covisible(self, images: Ints) -> Ints:
+        """Return the map images that observe the most points of the given map images."""
+        points = [self.map.observations(int(image))[1] for image in images]
+        return self.matcher.covisible(np.unique(np.concatenate([np.zeros(0, np.int64), *points])))
+
+    def _first_pose(
+        self,
+        query: RigQuery,
+        references: Sequence[References],
+        network_matches: Sequence[Sequence[NetworkMatches | None]],
+    ) -> tuple[Matches, Matches, Floats | None]:
+        """Match the query by descriptors and find a first pose by RANSAC.
+
+        The best references give most of the correct matches; later ones give mostly wrong matches, which slow RANSAC
+        down. So RANSAC runs on the best few references, and on more if the pose has few inliers. If most matches of the
+        best references are inliers, later references are matched only if they show another place, which may be a rival.
+
+        Returns:
+            All matches, the matches given to RANSAC, and the pose rig_from_world (4, 4), or None if there is none.
+        """
+        settings, cache = self.settings, MatchCache()
+        start: Floats | None = None
+        for count, enough in FIRST_REFERENCES.items():
+            if all(len(retrieved.images) <= count for retrieved in references):
+                break
+            best = [retrieved.take(np.arange(len(retrieved.images)) < count) for retrieved in references]
+            first_matches = self.matcher.by_descriptors(query, best, network_matches, cache)
+            start = self._ransac(query, first_matches, settings.ransac_max_error_deg)
+            none = np.zeros(len(first_matches), bool)
+            inliers = first_matches[none if start is None else self._inliers(query, start, first_matches)]
+            if self._independent(inliers) < enough:
+                start = None
+            elif len(inliers) > CLEAR_INLIER_RATIO * len(first_matches):
+                same_place = self.map.images_seeing(np.unique(inliers.point)) >= MIN_SHARED_POINTS
+                references = [
+                    retrieved.take((np.arange(len(retrieved.images)) < count) | ~same_place[retrieved.images])
+                    for retrieved in references
+                ]
+                break
+        matches = self.matcher.by_descriptors(query, references, network_matches, cache)
+        if start is not None:
+            return matches, first_matches, start
+        return matches, matches, self._ransac(query, matches, settings.ransac_max_error_deg)
+
+    def _hypotheses(
+        self, query: RigQuery, start: Floats, first_matches: Matches, matches: Matches, references: Sequence[References]
+    ) -> list[_Hypothesis]:
+        """Return refined poses, best supported first; one of them is refined from the first pose `start`.
+
+        With repeated structure (a row of similar windows), many descriptors agree with several poses, and RANSAC may
+        find one of them or something in between. So unless the first pose is clear, search for others: with a tighter
+        threshold, among the outliers of the first, and among the matches of single references. The number and errors
+        of guided matches decide: only at the correct pose does the rest of the map project where the query shows it.
+        """
+        settings = self.settings
+        hypotheses = [self._improve(query, start, matches)]
+        inliers = self._inliers(query, hypotheses[0].rig_from_world, matches)
+        share = float(inliers.mean())
+        if share > CLEAR_INLIER_RATIO:
+            return hypotheses
+        if share < CONTESTED_INLIER_RATIO:
+            other = self._ransac(query, first_matches, settings.max_error_deg)
+            if other is not None:
+                hypotheses.append(self._improve(query, other, matches))
+                inliers |= self._inliers(query, hypotheses[1].rig_from_world, matches)
+        rest = matches[~inliers]
+        # A pose with a smaller share of inliers is no rival.
+        least = RIVAL_SHARE * int(inliers.sum())
+        other = self._ransac(query, rest, settings.ransac_max_error_deg, least_inliers=int(least))
+        if other is not None:
+            count = self._inliers(query, other, rest).sum()
+            if share < CONTESTED_INLIER_RATIO or count >= least:
+                hypotheses.append(self._improve(query, other, matches))
+        if share < CONTESTED_INLIER_RATIO:
+            self._add_by_reference(query, matches, references, hypotheses)
+        return sorted(hypotheses, key=lambda hypothesis: -hypothesis.support)
+
+    def _add_by_reference(
+        self, query: RigQuery, matches: Matches, references: Sequence[References], hypotheses: list[_Hypothesis]
+    ) -> None:
+        """Add clearly different poses, found from the matches with single references."""
+        images = dict.fromkeys(int(index) for retrieved in references for index in retrieved.images)
+        seen_in = {index: np.isin(matches.point, self.map.observations(index)[1]) for index in images}
+        best = sorted(seen_in, key=lambda index: -int(seen_in[index].sum()))
+        for index in best[: CONTESTED_REFERENCES]:
+            start = self._ransac(query, matches[seen_in[index]], self.settings.ransac_max_error_deg, least_inliers=5)
+            if start is not None and not any(
+                agree(hypothesis.world_from_rig, geometry.invert(start)) for hypothesis in hypotheses
+            ):
+                hypotheses.append(self._improve(query, start, matches))
+
+    def _independent(self, inliers: Matches) -> int:
+        """Return the number of independent inliers: those that share a point or a keypoint count once."""
+        xy = inliers.pixels.astype(np.float32).view(np.uint64)[:, 0]  # x and y as one number
+        keypoints = sum(len(np.unique(xy[inliers.camera == camera])) for camera in np.unique(inliers.camera))
+        return min(len(np.unique(inliers.point)), keypoints)
+
+    def _inliers(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> NDArray[np.bool_]:
+        errors = query.errors_deg(rig_from_world, matches, self.map.points)
+        return errors < self.settings.ransac_max_error_deg
+
+    def _improve(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> _Hypothesis:
+        """Alternate between guided matching around the pose and refinement, while enough matches support it."""
+        settings = self.settings
+        pose, inliers = rig_from_world, matches[self._inliers(query, rig_from_world, matches)]
+        min_matches = max(4, 0.5 * len(np.unique(inliers.point)))
+        vicinity: Vicinity | None = None
+        for radius in self._radii_deg:
+            if vicinity is None or not vicinity.reaches(pose, radius):
+                images = self.matcher.covisible(np.unique(inliers.point))
+                vicinity = self.matcher.vicinity(query, pose, images, radius)
+            guided = vicinity.guided(pose, radius, MAX_GUIDED_MATCHES)
+            if len(guided) < min_matches:
+                break
+            refined = query.refine(pose, guided, self.map.points)
+            guided = guided[query.errors_deg(refined, guided, self.map.points) < settings.max_error_deg]
+            if len(guided) < min_matches:
+                break
+            pose, inliers = query.refine(refined, guided, self.map.points, close=True), guided
+        errors = query.errors_deg(pose, inliers, self.map.points) / settings.max_error_deg
+        return _Hypothesis(pose, inliers, float(np.maximum(1 - errors**2, 0).sum()))
+
+    def _estimate(
+        self, query: RigQuery, matches: Matches, hypotheses: list[_Hypothesis], references: Sequence[References]
+    ) -> PoseEstimate:
+        """Return the first hypothesis as an estimate, judged by the matches made without it and by its rivals.
+
+        The other hypotheses must be sorted by support, best first.
+        """
+        settings = self.settings
+        rig_from_world, guided = hypotheses[0].rig_from_world, hypotheses[0].matches
+        inliers = matches[self._inliers(query, rig_from_world, matches)]
+        independent = self._independent(inliers)
+        if independent < settings.min_inliers:
+            return PoseEstimate(
+                f"failed: too few inliers ({independent} within {settings.ransac_max_error_deg} deg)",
+                num_matches=len(matches),
+                num_inliers=independent,
+                correspondences=self._rejected(matches),
+            )
+        errors, rivals = query.errors_px(rig_from_world, guided, self.map.points), self._rivals(hypotheses)
+        unguided = matches[~np.isin(matches.rows(), guided.rows())]
+        unguided_agree = query.errors_deg(rig_from_world, unguided, self.map.points) < settings.max_error_deg
+        all_matches = Matches.pooled([guided, unguided])
+        agreeing = np.concatenate([np.ones(len(guided), bool), unguided_agree])
+        images = np.unique(np.concatenate([retrieved.images for retrieved in references]))
+        seen = self.map.images_seeing(np.unique(all_matches.point[agreeing]))[images]
+        used = [int(images[index]) for index in np.argsort(-seen, kind="stable") if seen[index]]
+        estimate = PoseEstimate(
+            status="ok",
+            world_from_rig=geometry.invert(rig_from_world),
+            covariance=self._covariance(query, rig_from_world, guided, np.isin(guided.rows(), inliers.rows())),
+            num_matches=len(matches),
+            num_inliers=independent,
+            num_guided=len(guided),
+            rmse_px=float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan"),
+            rival_support=rivals[0].support if rivals else 0.0,
+            rivals=tuple(rivals),
+            coverage=self._coverage(query, inliers),
+            agreement=self._agreement(inliers),
+            references=tuple(used),
+            correspondences=self._correspondences(all_matches, agreeing, len(guided), used),
+        )
+        evidence = {name: getattr(estimate, name) for name in EVIDENCE}
+        probability = bounded_by_rivals(float(probability_right(evidence)), [rival.support for rival in rivals])
+        probability = bounded_by_deviation(probability, estimate.position_std_m, estimate.rotation_std_deg)
+        estimate = replace(estimate, p_correct=probability)
+        certain = estimate.p_correct >= settings.ok_probability and estimate.rival_support <= MAX_RIVAL_SUPPORT
+        return estimate if certain else replace(estimate, status="low_confidence")
+
+    def _agreement(self, inliers: Matches) -> int:
+        """Return the number of inlier points of the kind of features that has the second most."""
+        counts = np.unique(self.matcher.kind_names(np.unique(inliers.point)), return_counts=True)[1]
+        return int(np.sort(counts)[-2]) if len(counts) > 1 else 0
+
+    def _coverage(self, query: RigQuery, inliers: Matches) -> float:
+        """Return the share of cells with an inlier, in a 4 x 4 grid over each query image."""
+        sizes = np.array([(camera.width, camera.height) for camera in query.cameras])
+        cells = np.clip(4 * inliers.pixels / sizes[inliers.camera], 0, 3).astype(np.int64)
+        return len(np.unique(np.column_stack([inliers.camera, cells]), axis=0)) / (16 * len(sizes))
+
+    def _correspondences(
+        self, matches: Matches, inlier: NDArray[np.bool_], guided: int, references: Sequence[int]
+    ) -> Correspondences:
+        """Return K matches as correspondences, with the keypoints of the first `VIEWS` references.
+
+        Args:
+            matches: guided matches first.
+            inlier: (K,) whether the pose agrees.
+            guided: number of guided matches.
+            references: map images, those that observe the most inliers first.
+        """
+        views = [(rank, *self.matcher.keypoints(i, matches.point)) for rank, i in enumerate(references[:VIEWS])]
+        found_by = np.repeat(["/guided", "/descriptors"], [guided, len(matches) - guided])
+        return Correspondences(
+            camera=matches.camera,
+            pixels=matches.pixels,
+            points=self.map.points[matches.point],
+            point_index=matches.point,
+            inlier=inlier,
+            found_by=np.char.add(self.matcher.kind_names(matches.point), found_by),
+            view_of=np.concatenate([np.zeros(0, np.int64), *(at for _, at, _ in views)]),
+            view_reference=np.concatenate([np.zeros(0, np.int64), *(np.full(len(at), rank) for rank, at, _ in views)]),
+            view_pixels=np.concatenate([np.zeros((0, 2)), *(pixels for _, _, pixels in views)]),
+        )
+
+    def _covariance(
+        self, query: RigQuery, rig_from_world: Floats, guided: Matches, found_twice: Bools
+    ) -> Floats | None:
+        """Return the covariance (6, 6) of a pose estimated from guided matches; None if it is undefined.
+
+        Guided matches were searched near the pose, so their errors are small wherever it is. Only those that were also
+        found by descriptors alone (`found_twice`) measure the spread of the errors; the others count for less.
+        """
+        of_pose, of_point = query.jacobians(rig_from_world, guided, self.map.points)
+        errors = query.errors_px(rig_from_world, guided, self.map.points)
+        weights, noise = np.where(found_twice, 1.0, GUIDED_WEIGHT), self._noise_of_points(query, guided, of_point)
+        of_matches = least_squares_covariance(of_pose, errors, noise, weights=weights)
+        return None if of_matches is None else of_matches + self._noise_of_poses
+
+    def _noise_of_points(self, query: RigQuery, matches: Matches, of_point: Floats) -> Floats:
+        """Return the covariance (K, 2, 2) of projections due to the noise of their points, square pixels; NaN: unknown.
+
+        `of_point` (K, 2, 3) are the derivatives of the K projections by their points.
+        """
+        noise = of_point @ self.map.point_covariances(matches.point) @ of_point.transpose(0, 2, 1)
+        # Inliers have errors below the threshold, so the noise of their points cannot be larger.
+        limit_px = np.tan(np.radians(self.settings.max_error_deg)) * query.focals_px[matches.camera]
+        share = limit_px**2 / np.maximum(np.trace(noise, axis1=1, axis2=2), 1e-12)
+        return np.asarray(noise * np.minimum(share, 1)[:, None, None], np.float64)
+
+    def _rejected(self, matches: Matches) -> Correspondences:
+        """Return the correspondences of matches that support no pose."""
+        return self._correspondences(matches, np.zeros(len(matches), bool), 0, [])
+
+    def _rivals(self, hypotheses: list[_Hypothesis]) -> list[Rival]:
+        """Return the poses that clearly differ from the best and from each other, with their relative support."""
+        kept = hypotheses[:1]
+        for other in hypotheses[1:]:
+            if all(_differ(one, other) for one in kept):
+                kept.append(other)
+        support = max(hypotheses[0].support, np.finfo(float).tiny)
+        return [Rival(other.world_from_rig, other.support / support) for other in kept[1:]]
+
+    def _ransac(self, query: RigQuery, matches: Matches, max_error_deg: float, least_inliers: int = 0) -> Floats | None:
+        return query.ransac(matches, self.map.points, max_error_deg, self.seed, least_inliers)
+
+
+def _differ(hypothesis: _Hypothesis, other: _Hypothesis) -> bool:
+    """Tell whether two hypotheses are clearly different poses: by more than half of what a right pose may be off."""
+    return not agree(hypothesis.world_from_rig, other.world_from_rig, share=0.5)

@@ -1,0 +1,331 @@
+"""Localize without matching: align a network's predicted cameras of the query and its references to the map."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+
+from toolkit import geometry
+from toolkit.alignment.pose_mean import robust_mean_pose
+from toolkit.alignment.robust import AlignmentError
+from toolkit.alignment.similarity import Alignment, align_to_map, is_trustworthy, query_pose
+from toolkit.capture import Session
+from toolkit.capture.depths import DepthMaps, SeenDepth, lifted
+from toolkit.capture.upright import Turns
+from toolkit.errors import first_line, reason_of
+from toolkit.geometry import Floats, Ints
+from toolkit.manifest import PredictorSettings
+from toolkit.mapping.local_map import LocalMap
+from toolkit.models.compute import RUNNING
+from toolkit.pose.base import CAMERA, PoseEstimate, Prior, Query, QueryInput, References, View, carried_over
+from toolkit.prediction.interface import Prediction, Predictor
+from toolkit.prediction.references import select_references
+from toolkit.threads import fixed_sums
+
+FOCAL_TOLERANCE = 0.2
+"""Difference between the log focal length ratios (predicted over stated) of query and references above which the stated
+focal length is wrong; several times the usual error of the networks."""
+MAX_DEPTH_POINTS = 200
+"""Largest number of map points per reference whose depth is compared with the prediction; those with the longest tracks
+are used."""
+MIN_POINTS = 20
+"""If a reference sees fewer map points, its depth map in the capture is used instead, if there is one."""
+
+
+@dataclass(frozen=True)
+class CameraAnswer:
+    """The result for one image of a query."""
+
+    references: Ints
+    """(k,) map images given to the network, in order of choice."""
+    prediction: Prediction | None = None
+    """Prediction for the query, first, and its references."""
+    alignment: Alignment | None = None
+    world_from_cam: Floats | None = None
+    """(4, 4); None if the rotation is unknown. If the scale is unknown, the position is that of the first consistent
+    reference."""
+    covariance: Floats | None = None
+    """(6, 6), see `PoseEstimate.covariance`."""
+    reason: str = ""
+    """What was left out or is unknown; without a pose, why there is none."""
+    depth_ratios: tuple[Floats, ...] = ()
+    """For each reference, metric over predicted depth at points of known depth."""
+    focal_px: float = np.nan
+    """Predicted focal length if it contradicts the camera, else NaN."""
+
+
+@dataclass(frozen=True)
+class QueryPrediction:
+    """A network's predictions for a query, not yet aligned to the map."""
+
+    references: tuple[Ints, ...]
+    """References chosen for each image of the query, see `CameraAnswer`."""
+    predictions: tuple[Prediction | str, ...]
+    """Prediction for each image, or the reason why there is none."""
+
+
+@dataclass(frozen=True)
+class FeedForwardAnswer:
+    """The estimate for a query device, and the results per image that it combines."""
+
+    estimate: PoseEstimate
+    cameras: tuple[CameraAnswer, ...] = ()
+
+
+_Groups = tuple[list[list[Ints]], dict[tuple[int, int], list[View]]]
+"""References chosen for each image of each query, and groups of views, keyed by query and image."""
+
+
+class FeedForwardLocalizer:
+    """Localizes queries in one map by predicted cameras."""
+
+    def __init__(
+        self,
+        local_map: LocalMap,
+        session: Session,
+        predictor: Predictor,
+        settings: PredictorSettings | None = None,
+        turns: Turns | None = None,
+        length: float = 1.0,
+    ):
+        """
+        Args:
+            local_map: the triangulated map.
+            session: session with the map images and their depth maps.
+            predictor: predicts the cameras.
+            settings: default if None.
+            turns: turns that make images upright for the predictor; None shows them as stored.
+            length: depths of the depth maps are divided by it, see `Survey.length`.
+        """
+        self.map = local_map
+        self.predictor = predictor
+        self.settings = settings or PredictorSettings()
+        self._session = session
+        self._depths = DepthMaps(session)
+        self._length = length
+        self._upright = turns is not None
+        self._turns = np.zeros(len(session.images), np.int64) if turns is None else turns.of(session)
+        self._next: tuple[Sequence[QueryInput], _Groups] = (), ([], {})
+        """Queries expected in the next call of `predict`, and their groups."""
+        self.image_names, self.batch_size = local_map.image_names, self.settings.batch_size
+
+    @fixed_sums
+    def localize(
+        self,
+        query: Query,
+        references: Sequence[References],
+        prediction: QueryPrediction | None = None,
+        priors: Sequence[Prior] = (),
+    ) -> PoseEstimate:
+        """Return the predicted pose of a query; see `Localizer`."""
+        return self.answer(query, references, prediction).estimate
+
+    @fixed_sums
+    def answer(
+        self, query: Query, references: Sequence[References], prediction: QueryPrediction | None = None
+    ) -> FeedForwardAnswer:
+        """Return the predicted pose of a query with the results per image; the arguments are those of `localize`.
+
+        Errors are not raised: the status of the estimate becomes `failed: <reason>`.
+        """
+        if prediction is None:
+            with RUNNING:  # `localize` is thread-safe, `predict` is not
+                (prediction,) = self.predict([(query, references)])
+        images = zip(query.views, prediction.references, prediction.predictions, strict=True)
+        cameras = tuple(self._camera_answer(*image) for image in images)
+        return FeedForwardAnswer(_combine(query, cameras), cameras)
+
+    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[QueryPrediction]:
+        """Return the predictions for each query, made in one call of the predictor; see `Localizer`.
+
+        `localize` aligns them to the map, in other threads while the network continues. An error in one query is not
+        raised and does not affect the other queries.
+
+        Raises:
+            Exception: a problem of all queries: the device does not exist, the weights are of another network, or the
+                memory is too small; see `errors.reason_of`.
+        """
+        expected, expected_groups = self._next
+        chosen, groups = expected_groups if queries is expected else self._groups(queries)
+        next_groups = self._groups(following)
+        self._next = following, next_groups
+        results = self._predict(list(groups.values()), list(next_groups[1].values()))
+        predictions = dict(zip(groups, results, strict=True))
+        return [
+            QueryPrediction(
+                tuple(references),
+                tuple(predictions.get((number, camera), "no references") for camera in range(len(references))),
+            )
+            for number, references in enumerate(chosen)
+        ]
+
+    def _groups(self, queries: Sequence[QueryInput]) -> _Groups:
+        chosen = [[self._choose(retrieved) for retrieved in references] for _, references in queries]
+        groups = {
+            (number, camera): [self._as_shown(query.views[camera]), *(self.view(int(index)) for index in references)]
+            for number, (query, _) in enumerate(queries)
+            for camera, references in enumerate(chosen[number])
+            if len(references)
+        }
+        return chosen, groups
+
+    def _as_shown(self, view: View) -> View:
+        return view if self._upright else replace(view, turns=0)
+
+    def view(self, index: int) -> View:
+        """Return a map image as the network gets it."""
+        name = self.map.image_names[index]
+        row = self._session.row_of_name[name]
+        return View(name, self._session.image_path(row), self.map.cameras[index], True, int(self._turns[row]))
+
+    def _choose(self, references: References) -> Ints:
+        """Choose the references of one query image."""
+        in_map = references.images < len(self.map.image_names)  # larger indices are images of other kinds of features
+        candidates = references.images[in_map]
+        if not len(candidates):
+            return candidates
+        points = [self.map.observations(int(index))[1] for index in candidates]
+        images = np.repeat(candidates, [len(observed) for observed in points])
+        depth = np.einsum("oj,oj->o", self.map.cams_from_world[images, 2, :3], self.map.points[np.concatenate(points)])
+        depth += self.map.cams_from_world[images, 2, 3]
+        chosen = select_references(
+            references.scores[in_map],
+            self.map.world_from_cams[candidates],
+            self.settings.num_references,
+            [self.map.cameras[int(index)] for index in candidates],
+            self.map.shared_points(candidates),
+            **({"depth_m": float(np.median(depth))} if len(depth) else {}),
+        )
+        return candidates[chosen]
+
+    def _predict(self, groups: list[list[View]], following: Sequence[list[View]] = ()) -> list[Prediction | str]:
+        """Return a prediction per group, or the reason why there is none."""
+        try:
+            return [*self.predictor.predict(groups, following)] if groups else []
+        except Exception as error:  # one bad query must not end a run; the groups are tried one by one
+            if len(groups) == 1:
+                return [reason_of(error, f"predicting {groups[0][0].name}")]
+        return [prediction for group in groups for prediction in self._predict([group])]
+
+    def _camera_answer(self, view: View, references: Ints, prediction: Prediction | str) -> CameraAnswer:
+        if isinstance(prediction, str):
+            return CameraAnswer(references, reason=prediction)
+        try:
+            cameras = [view.camera, *(self.map.cameras[int(index)] for index in references)]
+            return replace(self._align(references, prediction), focal_px=_other_focal(prediction, cameras))
+        except AlignmentError as error:
+            return CameraAnswer(references, prediction, reason=first_line(error))
+        except Exception as error:  # a predictor may return anything
+            return CameraAnswer(references, prediction, reason=reason_of(error, "aligning a prediction"))
+
+    def _align(self, references: Ints, prediction: Prediction) -> CameraAnswer:
+        model = np.asarray(prediction.model_from_cams, np.float64)
+        if not np.isfinite(model[0]).all():
+            reason = prediction.reason or "the predicted camera is not finite"
+            return CameraAnswer(references, prediction, reason=reason)
+        ratios = [self._depth_ratios(int(index), prediction, view) for view, index in enumerate(references, start=1)]
+        world = self.map.world_from_cams[references]
+        alignment = align_to_map(model[1:], world, depth_ratios=ratios if any(len(r) for r in ratios) else None)
+        if not np.isfinite(alignment.rotation_std_deg):
+            reason = alignment.reason or "the rotation is unknown"
+            return CameraAnswer(references, prediction, alignment, reason=reason, depth_ratios=tuple(ratios))
+        pose, covariance = query_pose(alignment, model[0])
+        if not alignment.scale_known:
+            # An arbitrary scale moves the query along a line; the position of a reference is a better guess.
+            pose[:3, 3] = world[int(np.argmax(alignment.inliers)), :3, 3]
+        return CameraAnswer(references, prediction, alignment, pose, covariance, alignment.reason, tuple(ratios))
+
+    def _depth_ratios(self, image: int, prediction: Prediction, view: int) -> Floats:
+        """Return metric over predicted depth (R,) at points that a map image observes."""
+        points = self._points(image)
+        in_cam = geometry.transform(self.map.cams_from_world[image], points)
+        in_cam = in_cam[in_cam[:, 2] > 0.1]
+        pixels = np.asarray(self.map.cameras[image].img_from_cam(in_cam), np.float64).reshape(-1, 2)
+        ratios = in_cam[:, 2] / prediction.depth_at(view, pixels)
+        return np.asarray(ratios[np.isfinite(ratios)], np.float64)
+
+    def _points(self, image: int) -> Floats:
+        """Return world points (P, 3) that a map image observes: triangulated, else from the capture's depth maps."""
+        points = np.unique(self.map.observations(image)[1])
+        if len(points) >= MIN_POINTS:
+            order = np.argsort(-self.map.track_lengths(points), kind="stable")[:MAX_DEPTH_POINTS]
+            return self.map.points[points[order]]
+        seen = self.seen_depth(image)
+        sample = np.linspace(0, len(seen) - 1, min(len(seen), MAX_DEPTH_POINTS)).astype(np.int64)
+        if not len(sample):
+            return self.map.points[points]
+        in_cam = lifted(self.map.cameras[image], seen.pixels[sample], seen.depth_m[sample])
+        return geometry.transform(self.map.world_from_cams[image], in_cam)
+
+    def seen_depth(self, image: int) -> SeenDepth:
+        """Return the depth of a map image from the capture's depth maps, in the unit of the local map."""
+        seen = self._depths.of(self._session.row_of_name[self.map.image_names[image]])
+        return replace(seen, depth_m=seen.depth_m / self._length)
+
+
+def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
+    """Combine the poses of the cameras of a device into one estimate."""
+    count = sum(len(answer.references) for answer in cameras if answer.prediction is not None)
+    reasons = "; ".join(dict.fromkeys(answer.reason for answer in cameras if answer.reason))
+    alignments = {index: answer.alignment for index, answer in enumerate(cameras) if answer.alignment is not None}
+    poses = {index: answer.world_from_cam for index, answer in enumerate(cameras) if answer.world_from_cam is not None}
+    covariances = {index: answer.covariance for index, answer in enumerate(cameras) if answer.covariance is not None}
+    if not poses:
+        return PoseEstimate(f"failed: {reasons}", num_matches=count, found_by="feed_forward")
+    known = [index for index in poses if np.isfinite(covariances[index]).all()]
+    if known:
+        mean = robust_mean_pose(
+            np.stack([poses[index] for index in known]) @ geometry.invert(query.rig_from_cams[known]),
+            np.stack([carried_over(covariances[index], query.rig_from_cams[index]) for index in known]),
+        )
+        pose, covariance = mean.world_from_cam, mean.covariance
+        kept = [index for index, inside in zip(known, mean.inliers, strict=True) if inside]
+        reasons = "; ".join(filter(None, (reasons, mean.reason)))
+        agreed = np.isfinite(covariance).all() and 2 * len(kept) > len(known)
+        sure = agreed and any(is_trustworthy(alignments[index], covariance) for index in kept)
+    else:
+        best = min(poses, key=lambda index: alignments[index].rotation_std_deg)
+        rig_from_cam = query.rig_from_cams[best]
+        kept, pose, sure = [best], poses[best] @ geometry.invert(rig_from_cam), False
+        R, covariance = rig_from_cam[:3, :3], np.diag(np.full(6, np.inf))
+        covariance[:3, :3] = R @ covariances[best][:3, :3] @ R.T
+    focals = tuple(answer.focal_px for answer in cameras)
+    misfit = bool(np.isfinite(focals).any())
+    if misfit:
+        seen = ", ".join(f"{focal:.0f}" for focal in focals if np.isfinite(focal))
+        reasons = "; ".join(filter(None, (reasons, f"the network sees a focal length of {seen} px")))
+    consistent = [int(i) for index in kept for i in cameras[index].references[alignments[index].inliers]]
+    shown = [int(i) for answer in cameras if answer.prediction is not None for i in answer.references]
+    return PoseEstimate(
+        status=CAMERA if misfit else "ok" if sure else "low_confidence",
+        world_from_rig=pose,
+        covariance=covariance,
+        num_matches=count,
+        num_inliers=len(consistent),
+        references=tuple(dict.fromkeys(consistent)),
+        found_by="feed_forward",
+        scale_std=min(alignments[index].scale_std for index in kept),
+        rejected=tuple(index for index in dict.fromkeys(shown) if index not in consistent),
+        reason=reasons,
+        misfit=misfit,
+        focals_px=focals if misfit else (),
+    )
+
+
+def _other_focal(prediction: Prediction, cameras: Sequence[pycolmap.Camera]) -> float:
+    """Return the predicted focal length of the first photograph of a group if it contradicts the camera, else NaN.
+
+    A network errs by some percent, equally for all photographs of a group, so the references give its error.
+    """
+    if prediction.intrinsics is None:
+        return np.nan
+    predicted_px = prediction.intrinsics[:, [0, 1], [0, 1]].mean(axis=1)
+    ratios = predicted_px / [camera.mean_focal_length() for camera in cameras]
+    logs = np.log(np.where(np.isfinite(ratios) & (ratios > 0), ratios, np.nan))
+    of_references = logs[1:][np.isfinite(logs[1:])]
+    if not len(of_references) or not np.isfinite(logs[0]):
+        return np.nan
+    middle = float(np.median(of_references))
+    limit = max(FOCAL_TOLERANCE, 4 * float(np.median(np.abs(of_references - middle))))
+    return float(cameras[0].mean_focal_length() * np.exp(logs[0] - middle)) if abs(logs[0] - middle) > limit else np.nan

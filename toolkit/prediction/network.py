@@ -1,0 +1,389 @@
+"""A network as a predictor: batching of views, choice of device, and cache of encodings."""
+
+import logging
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from toolkit.capture.images import default_workers, prefetch, read_image
+from toolkit.capture.turning import turn_image, turned_from_cam
+from toolkit.errors import ImageError, ManifestError, ToolkitError, first_line
+from toolkit.files import files_fingerprint
+from toolkit.geometry import invert, make_pose
+from toolkit.models.compute import PRECISIONS, Fitting, on_device, resolve_device, resolve_precision
+from toolkit.models.weights import resolve_weights
+from toolkit.pose.base import View
+from toolkit.prediction.architectures import ARCHITECTURES, HEADS, Architecture, Size
+from toolkit.prediction.interface import Prediction
+from toolkit.prediction.network_input import PlacedView, shown_size
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+    _Begun = dict[tuple[Path | int, Size, int], Future[Tensor | ImageError | None]]
+
+log = logging.getLogger(__name__)
+
+CACHE_BYTES = 2 << 30
+"""Size of the cache for encodings of map images: 500 of them at 518 x 392 in float32, twice as many in bfloat16."""
+_GROUPS_AT_A_TIME = 8  # on a CPU 1: one group keeps it busy, and a batch needs more memory and is not faster
+_IMAGES_AT_A_TIME = 8
+_LEAST_VIEWS = 2  # the query and one reference
+
+
+class TokenCache:
+    """Least recently used cache of encodings of map images. Not thread-safe."""
+
+    def __init__(self, max_bytes: int) -> None:
+        self.max_bytes = max_bytes
+        self.bytes = 0
+        self._kept: OrderedDict[Any, Tensor] = OrderedDict()
+
+    def __contains__(self, key: Any) -> bool:
+        return key in self._kept
+
+    def get(self, key: Any) -> "Tensor | None":
+        """Return the encoding of a key, or None."""
+        if key in self._kept:
+            self._kept.move_to_end(key)
+        return self._kept.get(key)
+
+    def put(self, key: Any, tokens: "Tensor") -> None:
+        """Add an encoding and drop old ones to make room; an encoding larger than the cache is not kept."""
+        if key in self._kept or tokens.nbytes > self.max_bytes:
+            return
+        self._kept[key] = tokens
+        self.bytes += tokens.nbytes
+        while self.bytes > self.max_bytes:
+            self.bytes -= self._kept.popitem(last=False)[1].nbytes
+
+
+class NetworkPredictor:
+    """Runs a network. The constructor finds the weights, the first prediction loads them.
+
+    Encodings of map images are cached; for VGGT, encoding is a fifth of the work.
+    """
+
+    simulated = False
+
+    def __init__(
+        self,
+        checkpoint: str | Path | None = None,
+        compute_device: str = "auto",
+        dtype_compute: str = "auto",
+        *,
+        batch_size: int | None = None,
+        cache_bytes: int = CACHE_BYTES,
+        architecture: Architecture = ARCHITECTURES["vggt"],
+        compile: bool = False,  # noqa: A002
+    ) -> None:
+        """
+        Args:
+            checkpoint: file with the weights; None takes the hub's cache, else downloads them.
+            compute_device, dtype_compute: see `models.compute`. float16 is refused, as activations of the trunk may
+                overflow it; `auto` takes float32 where it would choose float16. The heads always run in float32.
+            batch_size: largest number of groups per batch; None takes a default for the device.
+            cache_bytes: memory of the CPU for encodings of map images.
+            architecture: the network.
+            compile: see `PredictorSettings`.
+
+        Raises:
+            ManifestError: the precision does not exist or is float16.
+            WeightsError: the weights are missing.
+        """
+        expected = [name for name in PRECISIONS if name != "float16"]
+        if dtype_compute not in expected:
+            title = architecture.title
+            raise ManifestError(f"dtype_compute is {dtype_compute!r}; {title} expects one of {', '.join(expected)}.")
+        self._architecture, self.name = architecture, architecture.name
+        self.checkpoint = resolve_weights(architecture.weights, checkpoint)
+        self.compute_device, self.dtype_compute = compute_device, dtype_compute
+        self._batch_size = batch_size
+        self._compile = compile
+        self._cache = TokenCache(cache_bytes)
+        self._fitting: dict[tuple[int, Size], Fitting] = {}
+        self._most_views: dict[Size, int] = {}
+        self._begun: _Begun = {}
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """Everything besides the views that the predictions depend on. The device only changes rounding."""
+        weights = files_fingerprint([self.checkpoint])
+        precision = str(self._dtype).removeprefix("torch.")
+        return {"name": self.name, "weights": weights, "dtype_compute": precision, "depth": True}
+
+    @cached_property
+    def _device(self) -> "torch.device":
+        return resolve_device(self.compute_device)
+
+    @cached_property
+    def _dtype(self) -> "torch.dtype":
+        import torch
+
+        dtype = resolve_precision(self.dtype_compute, self._device)
+        return torch.float32 if dtype == torch.float16 else dtype
+
+    @cached_property
+    def _model(self) -> Any:
+        return _load_network(self._architecture, self.checkpoint, self._dtype, self._device, self._compile)
+
+    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
+        """Return a prediction for each group of views. The first view of a group is the query.
+
+        A prediction has as many views as its group. Views that the network did not get have NaN in `model_from_cams`
+        and `depth`, and 0 in `depth_conf`. The log says why:
+
+        - The file is missing, cannot be decoded, or does not have the size of its camera. If this is the query, the
+          whole prediction is NaN, without depth, and gives the reason.
+        - The group alone does not fit the memory; then it is halved, and its last references are left out.
+
+        No other error is raised for a group, and groups do not influence each other. Groups with equal numbers of views
+        and equal image size run in one batch. A batch that does not fit the memory is halved.
+
+        Args:
+            groups: views of photographs.
+            following: groups of the next call; their first photographs are decoded while the network runs.
+
+        Raises:
+            WeightsError: at the first call, the file does not belong to this network.
+            ToolkitError: the device does not exist, or its memory does not hold a query and one reference.
+        """
+        placed = [self._place(group) for group in groups]
+        begun = self._read_ahead(placed, [self._place(group) for group in following])
+        results = [_nothing(len(group)) for group in groups]
+        alike: dict[tuple[int, Size], list[int]] = {}
+        for number, group in enumerate(placed):
+            if group:
+                alike.setdefault((len(group), group[0].size), []).append(number)
+        batch_size = self._batch_size or (1 if self._device.type == "cpu" else _GROUPS_AT_A_TIME)
+        for numbers in alike.values():
+            batches = [numbers[start : start + batch_size] for start in range(0, len(numbers), batch_size)]
+            encoded = self._encoded([[placed[number] for number in batch] for batch in batches], begun)
+            for batch, tokens in zip(batches, encoded, strict=True):
+                for number, prediction in self._run(batch, [placed[number] for number in batch], tokens).items():
+                    results[number] = prediction
+        return results
+
+    def _place(self, group: Sequence[View]) -> list[PlacedView]:
+        """Return the views of a group with their places in network images of one size."""
+        layout = self._architecture.lay_out([shown_size(view) for view in group])
+        return [PlacedView(view, layout, number) for number, view in enumerate(group)]
+
+    def _read_ahead(self, groups: Sequence[list[PlacedView]], following: Sequence[list[PlacedView]]) -> "_Begun":
+        """Start to decode the first photographs of the following groups; return those that the last call started.
+
+        Photographs whose encoding is cached, or will be after the current groups, are not decoded.
+        """
+        begun = self._begun
+        encoded = {placed.key for group in groups for placed in group if placed.view.in_map}
+        files = {placed.key: placed for group in following for placed in group if isinstance(placed.view.image, Path)}
+        new = [key for key in files if key not in encoded and key not in self._cache]
+        workers = default_workers()
+        pool = ThreadPoolExecutor(workers)
+        self._begun = {key: pool.submit(self._read, files[key]) for key in new[: workers + _IMAGES_AT_A_TIME]}
+        pool.shutdown(wait=False)
+        return begun
+
+    def _encoded(
+        self, batches: Sequence[Sequence[Sequence[PlacedView]]], begun: "_Begun"
+    ) -> "Iterator[list[list[Tensor | str]]]":
+        """Yield, per batch, the tokens (P, C) of each view of each group, or the reason why it cannot be read.
+
+        Other threads decode the next photographs in the meantime, except those whose encoding is cached.
+        """
+
+        def read(placed: PlacedView | None) -> "Tensor | ImageError | None":
+            future = begun.pop(placed.key, None) if placed else None
+            return future.result() if future else self._read(placed)
+
+        decoded = prefetch(read, self._to_read(batches), workers=default_workers(), ahead=_IMAGES_AT_A_TIME)
+        for batch in batches:
+            tokens: dict[Any, Tensor | str] = {}
+            waiting: dict[Any, tuple[PlacedView, Tensor]] = {}
+            for placed in (placed for group in batch for placed in group):
+                image = next(decoded)
+                cached = self._cache.get(placed.key)
+                if cached is not None:
+                    tokens[placed.key] = cached
+                if cached is not None or placed.key in waiting:
+                    continue
+                # The encoding was cached when the image was to be decoded, and has been dropped since.
+                image = self._read(placed) if image is None else image
+                if isinstance(image, ImageError):
+                    log.warning("%s: left out. %s", placed.view.name, image)
+                    tokens[placed.key] = str(image)
+                elif image is not None:
+                    waiting[placed.key] = (placed, image)
+            tokens.update(self._encode(list(waiting.values())))
+            yield [[tokens[placed.key] for placed in group] for group in batch]
+
+    def _to_read(self, batches: Sequence[Sequence[Sequence[PlacedView]]]) -> Iterator[PlacedView | None]:
+        """Yield each view, or None for a map image whose encoding is cached or will be by then."""
+        read = set()
+        for placed in (placed for batch in batches for group in batch for placed in group):
+            yield None if placed.key in self._cache or placed.key in read else placed
+            if placed.view.in_map:
+                read.add(placed.key)
+
+    def _read(self, placed: PlacedView | None) -> "Tensor | ImageError | None":
+        """Return the network image (3, H, W) of a view, the error if it cannot be read, or None for None."""
+        if placed is None:
+            return None
+        try:
+            image, turns = placed.view.image, placed.view.turns
+            if turns:
+                image = turn_image(read_image(image) if isinstance(image, Path) else image, turns)
+            pixels, actual = self._architecture.read(image, placed.layout)
+        except ImageError as error:
+            return error
+        expected = shown_size(placed.view)
+        if actual != expected:
+            turned = " when upright" if turns else ""
+            return ImageError(
+                f"Image of {actual[0]} x {actual[1]} pixels{turned}: {placed.view.name}; its camera has "
+                f"{expected[0]} x {expected[1]}. Correct the size in `sensors.txt`, or the image."
+            )
+        return pixels
+
+    def _encode(self, images: "Sequence[tuple[PlacedView, Tensor]]") -> "dict[Any, Tensor]":
+        """Return tokens (P, C) of images (3, H, W) of one size, by key; cache those of map images."""
+        import torch
+
+        # Measured: tokens in float16 change depth by 1.2e-4 of its value; a trunk in bfloat16 changes it by 4e-3.
+        dtype = torch.float32 if self._dtype == torch.float32 else torch.float16
+        fitting = Fitting(self._model.encode, "images", self._device)
+        tokens = {}
+        for start in range(0, len(images), _IMAGES_AT_A_TIME):
+            part = images[start : start + _IMAGES_AT_A_TIME]
+            batch = torch.stack([image for _, image in part])
+            for (placed, _), of_image in zip(part, fitting(batch).to("cpu", dtype), strict=True):
+                tokens[placed.key] = of_image.clone()  # a view would keep the whole batch in memory
+                if placed.view.in_map:
+                    self._cache.put(placed.key, tokens[placed.key])
+        return tokens
+
+    def _run(
+        self, numbers: Sequence[int], groups: Sequence[list[PlacedView]], tokens: "Sequence[list[Tensor | str]]"
+    ) -> dict[int, Prediction]:
+        """Return the predictions of a batch, by number of the group."""
+        import torch
+
+        alike: dict[int, list[tuple[int, list[PlacedView], list[int], Tensor]]] = {}
+        results = {}
+        for number, group, of_group in zip(numbers, groups, tokens, strict=True):
+            if isinstance(of_group[0], str):
+                results[number] = _nothing(len(group), of_group[0])
+                continue
+            encoded = {index: one for index, one in enumerate(of_group) if not isinstance(one, str)}
+            stacked = torch.stack(list(encoded.values()))
+            alike.setdefault(len(encoded), []).append((number, group, list(encoded), stacked))
+        for rows in alike.values():
+            output = self._forward(torch.stack([stacked for *_, stacked in rows]), rows[0][1][0].size).numpy()
+            for (number, group, readable, _), values in zip(rows, output, strict=True):
+                results[number] = self._prediction(group, readable[: len(values)], values)
+        return results
+
+    def _forward(self, tokens: "Tensor", size: Size) -> "Tensor":
+        """Return outputs (B, S, 9 + 2 H W) on the CPU for tokens (B, S, P, C); S shrinks if the memory is too small."""
+        import torch
+
+        while True:
+            views = min(tokens.shape[1], self._most_views.get(size, tokens.shape[1]))
+            new = Fitting(self._network(size), f"groups of {views} views", self._device)
+            run = self._fitting.setdefault((views, size), new)
+            try:
+                with torch.inference_mode():
+                    return run(tokens[:, :views])
+            except ToolkitError as error:
+                if views <= _LEAST_VIEWS:
+                    raise ToolkitError(
+                        f"The memory of {self._device} does not hold {self._architecture.title} with {views} views of "
+                        f"{size[1]} x {size[0]} pixels. Use dtype_compute: bfloat16, or compute_device: cpu."
+                    ) from error
+            self._most_views[size] = max(_LEAST_VIEWS, views // 2)
+            log.warning("continuing with the first %d views of each group", self._most_views[size])
+
+    def _network(self, size: Size) -> "Callable[[Tensor], Tensor]":
+        """Return the network as a function of tokens (B, S, P, C) of images (H, W)."""
+        import torch
+
+        def run(tokens: "Tensor") -> "Tensor":
+            images = torch.empty(*tokens.shape[:2], 3, *size, device="meta")
+            output = self._model(images, HEADS, tokens.float())
+            dense = [output[name].flatten(2) for name in ("depth", "depth_conf")]
+            return torch.cat([output["pose_enc"], *dense], dim=-1).cpu()
+
+        return run
+
+    def _prediction(self, group: list[PlacedView], shown: Sequence[int], output: NDArray[np.float32]) -> Prediction:
+        """Convert the network output (shown views, 9 + 2 H W) to the prediction of a group."""
+        poses, intrinsics = np.full((len(group), 4, 4), np.nan), np.full((len(group), 3, 3), np.nan)
+        size = group[0].size
+        for index, encoding in zip(shown, output[:, :9].astype(np.float64), strict=True):
+            if np.isfinite(encoding).all() and encoding[3:7].any():
+                cam_from_model, K = self._architecture.cameras(encoding, size)
+                model_from_turned = invert(make_pose(cam_from_model[:, :3], cam_from_model[:, 3]))
+                poses[index] = model_from_turned @ turned_from_cam(group[index].view.turns)
+                intrinsics[index] = group[index].intrinsics(K)
+        map_from_image = np.stack([placed.map_from_image for placed in group])
+        depth = [placed.turned_back(np.full(size, np.nan, np.float32)) for placed in group]
+        confidence = [placed.turned_back(np.zeros(size, np.float32)) for placed in group]
+        maps = output[:, 9:].reshape(len(shown), 2, *size)
+        for index, (depth_map, confidence_map) in zip(shown, maps, strict=True):
+            placed, outside = group[index], group[index].outside
+            depth[index] = placed.turned_back(np.where(outside, np.float32(np.nan), depth_map))
+            confidence[index] = placed.turned_back(np.where(outside, np.float32(np.nan), confidence_map))
+        return Prediction(poses, depth, confidence, map_from_image, intrinsics)
+
+
+_loaded: dict[tuple[Any, ...], Any] = {}
+"""The network that was loaded last, by its key; at most one."""
+
+
+def _load_network(
+    architecture: Architecture,
+    checkpoint: Path,
+    dtype: "torch.dtype",
+    device: "torch.device",
+    compiled: bool,
+) -> Any:
+    """Return a network, ready to run.
+
+    The last network stays loaded: a notebook that inspects a query after a run creates a new predictor, and loading
+    gigabytes of weights again would be slow.
+    """
+    key = (checkpoint.resolve(), files_fingerprint([checkpoint]), architecture.name, dtype, device, compiled)
+    if key not in _loaded:
+        _loaded.clear()  # before loading, as the memory may hold only one network
+        network = on_device(architecture.load(checkpoint, dtype), device, architecture.title)
+        if compiled:
+            _compile(network, architecture, device)
+        _loaded[key] = network
+    return _loaded[key]
+
+
+def _compile(network: Any, architecture: Architecture, device: "torch.device") -> None:
+    """Compile the blocks of a network and run them once, so that compilation fails before the first query."""
+    import torch
+
+    network.compile_blocks()
+    side = 2 * architecture.patch
+    try:
+        with torch.inference_mode():
+            network(torch.zeros(1, _LEAST_VIEWS, 3, side, side, device=device), ("camera",))
+    except Exception as error:  # torch, its compilers and the programs that they call raise anything
+        raise ToolkitError(
+            f"torch cannot compile {architecture.title} on {device} ({first_line(error)}). Use "
+            "localize.predictor.compile: false."
+        ) from error
+
+
+def _nothing(views: int, reason: str = "") -> Prediction:
+    return Prediction(np.full((views, 4, 4), np.nan), reason=reason)

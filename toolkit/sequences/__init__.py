@@ -1,0 +1,1 @@
+"""Recordings with odometry: pose graphs, and frame by frame."""

@@ -1,0 +1,247 @@
+"""Python interface to localize frames with odometry: a whole recording, or frame by frame while a device moves."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import ArrayLike, NDArray
+
+from toolkit import geometry
+from toolkit.errors import CameraError, ImageError
+from toolkit.geometry import Floats, Ints
+from toolkit.manifest import SequenceSettings
+from toolkit.pose.base import PoseEstimate, RoughPose, carried_over
+from toolkit.scene.locate import Picture, localize_image
+from toolkit.scene.map import Map
+from toolkit.sequences.odometry import Odometry, cut, with_measured_drift
+from toolkit.sequences.piece import localize_piece, queries_of
+from toolkit.sequences.pose_graph import FAR, PlacedPiece, is_sure
+from toolkit.threads import fixed_sums
+
+Pictures = Picture | Sequence[Picture] | None
+"""The picture of a frame, one picture per camera of a rig, or None for a frame with odometry only."""
+Cameras = pycolmap.Camera | Sequence[pycolmap.Camera]
+
+
+@dataclass(frozen=True)
+class LocalizedFrames:
+    """The poses of N frames in the map."""
+
+    world_from_rig: Floats
+    """(N, 4, 4), NaN for none; with a single camera, world_from_cam."""
+    covariances: Floats
+    """(N, 6, 6) of a small motion in the rig's frame: rotation, radians, then translation, meters."""
+    status: NDArray[np.object_]
+    """(N,) `ok`, `low_confidence: <reason>` or `failed: <reason>`."""
+    piece: Ints
+    """(N,) number of the piece of odometry; losses of tracking separate pieces."""
+    single: dict[int, PoseEstimate]
+    """Estimate from each picture alone, by frame."""
+    again: dict[int, PoseEstimate]
+    """Estimates of doubtful pictures that were localized again near their predicted pose, by frame."""
+
+
+def _localize(
+    map_: Map,
+    rig_from_cams: NDArray[np.float64] | None,
+    turns: Sequence[int] | None,
+    picture: Pictures,
+    cameras: Cameras,
+    near: RoughPose | None = None,
+) -> PoseEstimate:
+    """Localize the picture of a frame, alone or near a pose. A picture that cannot be read gives `failed`."""
+    try:
+        return localize_image(map_, picture, cameras, rig_from_cams, turns, near=near)
+    except CameraError:
+        raise
+    except ImageError as error:
+        return PoseEstimate(f"failed: {error}")
+
+
+@fixed_sums
+def localize_sequence(
+    map_: Map,
+    images: Sequence[Pictures],
+    cameras: Cameras | Sequence[Cameras],
+    odometry: Odometry,
+    settings: SequenceSettings | dict[str, Any] | None = None,
+    rig_from_cams: NDArray[np.float64] | None = None,
+    turns: Sequence[int] | None = None,
+) -> LocalizedFrames:
+    """Localize the N frames of a recording, with and without pictures.
+
+    Args:
+        map_: an open map, see `Map.open`.
+        images: for each frame its picture, the C pictures of a rig, or None.
+        cameras: the intrinsics of all pictures, or a list with those of each of the N frames, because they may change
+            when a phone focuses. For a rig, each is a sequence of C.
+        odometry: the device's own poses of the N frames. Losses of tracking are detected.
+        settings: see `SequenceSettings`; a dict holds values that differ from the defaults. If `online`, only frames
+            with a picture get a pose, estimated from the frames before them.
+        rig_from_cams, turns: see `localize_image`.
+
+    Raises:
+        ValueError: the numbers of images and poses differ, or there is neither one camera nor one per image.
+        ManifestError: GTSAM is not installed.
+        CameraError: a camera is missing, or does not fit the pictures. A picture that cannot be read is `failed`.
+    """
+    settings = SequenceSettings.of(settings)
+    if len(images) != len(odometry):
+        raise ValueError(f"Found {len(images)} images and {len(odometry)} poses: expected one of each per frame.")
+    cams: Any = cameras
+    first = cams[0] if isinstance(cams, list | tuple) and rig_from_cams is not None else cams
+    cams_of_frames = list(cams) if isinstance(first, list | tuple) else [cams] * len(images)
+    if len(cams_of_frames) != len(images):
+        raise ValueError(
+            f"Found {len(cams_of_frames)} cameras and {len(images)} images: expected one for all, or one per image."
+        )
+    localize = partial(_localize, map_, rig_from_cams, turns)
+    single = {frame: localize(image, cams_of_frames[frame]) for frame, image in enumerate(images) if image is not None}
+    piece, again = np.zeros(len(odometry), int), dict[int, PoseEstimate]()
+    placed = list[PlacedPiece]()
+    pieces, queries = odometry.split(), queries_of(single)
+    if not settings.online:
+        settings = with_measured_drift([(odometry.part(rows), queries.part(rows)) for rows in pieces], settings)
+        pieces = [
+            slice(rows.start + part.start, rows.start + part.stop)
+            for rows in pieces
+            for part in cut(odometry.part(rows), queries.part(rows), settings)
+        ]
+    for number, rows in enumerate(pieces):
+        piece[rows] = number
+        frames = np.array([frame for frame in single if rows.start <= frame < rows.stop], np.int64)
+
+        def localize_again(todo: Sequence[tuple[int, RoughPose]], start: int = rows.start) -> list[PoseEstimate]:
+            return [localize(images[start + frame], cams_of_frames[start + frame], near) for frame, near in todo]
+
+        relocalize = localize_again if settings.relocalize else None
+        done = localize_piece(odometry.part(rows), queries.part(rows), frames - rows.start, settings, relocalize)
+        again |= {rows.start + frame: estimate for frame, estimate in done.again.items()}
+        placed.append(done.placed)
+    return LocalizedFrames(
+        np.concatenate([np.zeros((0, 4, 4)), *(part.world_from_rig for part in placed)]),
+        np.concatenate([np.zeros((0, 6, 6)), *(part.covariances for part in placed)]),
+        np.concatenate([np.zeros(0, object), *(part.status for part in placed)]),
+        piece,
+        single,
+        again,
+    )
+
+
+class SequenceLocalizer:
+    """Localizes a moving device frame by frame, from the current and earlier frames.
+
+    Each picture solves the pose graph of the last `settings.length_s` seconds (None: of the whole piece). With 600
+    frames this takes some 50 ms, besides localization of the picture. Between pictures, odometry continues the last
+    solution.
+    """
+
+    def __init__(
+        self,
+        map_: Map,
+        settings: SequenceSettings | dict[str, Any] | None = None,
+        rig_from_cams: NDArray[np.float64] | None = None,
+        turns: Sequence[int] | None = None,
+    ) -> None:
+        """See `localize_sequence`; `settings.length_s` is the window."""
+        self.settings = self._drift = SequenceSettings.of({"online": True}, settings)
+        self._localize = partial(_localize, map_, rig_from_cams, turns)
+        self._timestamps, self._poses = list[int](), list[Floats]()
+        self._queries = queries_of({})
+        """Single poses of the current piece, including those found again."""
+        self._solved: tuple[int, PlacedPiece] | None = None
+        """Frame of the last picture, and the solution there."""
+        self.single: PoseEstimate | None = None
+        """Estimate from the latest frame's picture alone; None if it had no picture."""
+
+    @fixed_sums
+    def add(
+        self, timestamp: int, odom_from_rig: ArrayLike, image: Pictures = None, cameras: Cameras | None = None
+    ) -> PoseEstimate:
+        """Add a frame and return its pose, with `found_by` = `sequence`.
+
+        Args:
+            timestamp: microseconds, later than the last one.
+            odom_from_rig: (4, 4) pose by the device's odometry; with a single camera, odom_from_cam.
+            image: the frame's picture, or a sequence of pictures of a rig; None: odometry only.
+            cameras: the intrinsics; a sequence for a rig.
+
+        Raises:
+            ValueError: the timestamp is not later than the last one, or the pose is invalid.
+            CameraError: a camera is missing, or does not fit the picture. A picture that cannot be read is `failed`.
+            ManifestError: GTSAM is not installed.
+        """
+        pose = np.asarray(odom_from_rig, np.float64)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise ValueError(f"odom_from_rig: found {pose.tolist()}, expected a pose (4, 4) of finite numbers.")
+        if self._timestamps and timestamp <= self._timestamps[-1]:
+            raise ValueError(f"timestamp: found {timestamp} after {self._timestamps[-1]}, expected a later one.")
+        cams: Any = cameras
+        # Before the frame is added, so that it can be added again after an error.
+        self.single = None if image is None else self._localize(image, cams)
+        self._timestamps.append(int(timestamp))
+        self._poses.append(pose)
+        latest = self._since(-4)
+        if latest.split()[-1].start == len(latest) - 1:  # tracking was lost: start a new piece
+            del self._timestamps[:-1], self._poses[:-1]
+            self._queries, self._solved = queries_of({}), None
+        if self.single is None:
+            return self._extrapolate()
+        self._queries = self._queries.joined(queries_of({len(self._poses) - 1: self.single}))
+        return self._solve(image, cams)
+
+    def _since(self, start: int) -> Odometry:
+        return Odometry(np.array(self._timestamps[start:], np.int64), np.stack(self._poses[start:]))
+
+    def _drop_before(self, start: int) -> None:
+        del self._timestamps[:start], self._poses[:start]
+        self._queries = self._queries.part(slice(start, start + len(self._poses)))
+
+    def _solve(self, image: Pictures, cameras: Cameras) -> PoseEstimate:
+        if self.settings.length_s is not None:
+            oldest = self._timestamps[-1] - self.settings.length_s * 1e6
+            self._drop_before(int(np.searchsorted(self._timestamps, oldest)))
+        self._drift = with_measured_drift([(self._since(0), self._queries)], self.settings)
+        self._drop_before(cut(self._since(0), self._queries, self._drift)[-1].start)
+        window = self._since(0)
+        offline = self._drift.model_copy(update={"online": False, "length_s": None})
+
+        def localize_again(todo: Sequence[tuple[int, RoughPose]]) -> list[PoseEstimate]:
+            return [self._localize(image, cameras, near) for _, near in todo]
+
+        again = localize_again if self.settings.relocalize else None
+        done = localize_piece(window, self._queries, np.array([len(window) - 1]), offline, again)
+        self._queries, placed = done.queries, done.placed
+        self._solved = len(window) - 1, placed
+        if not np.isfinite(placed.world_from_rig[-1]).all():
+            return PoseEstimate(str(placed.status[-1]), found_by="sequence")
+        return self._estimate(placed.world_from_rig[-1], placed.covariances[-1], str(placed.status[-1]))
+
+    def _extrapolate(self) -> PoseEstimate:
+        """Return the pose of the latest frame by odometry from the last picture."""
+        if self._solved is None:
+            return PoseEstimate("failed: no query of this piece has a pose", found_by="sequence")
+        last, placed = self._solved
+        status = str(placed.status[-1])
+        if not np.isfinite(placed.world_from_rig[-1]).all():
+            return PoseEstimate(status, found_by="sequence")
+        since = self._since(last).scaled(placed.scale)
+        step = geometry.invert(since.odom_from_rig[0]) @ since.odom_from_rig[-1]
+        rotation_std, position_std = since.drift(self._drift, np.array([0]), np.array([len(since) - 1]))
+        position_std = np.hypot(position_std, self.settings.scale_std * np.linalg.norm(step[:3, 3]))
+        covariance = carried_over(placed.covariances[-1], geometry.invert(step))
+        covariance += np.diag(np.repeat([rotation_std[0], position_std[0]], 3) ** 2)
+        status = FAR if status == "ok" and not is_sure(covariance[None])[0] else status
+        return self._estimate(placed.world_from_rig[-1] @ step, covariance, status)
+
+    def _estimate(self, pose: Floats, covariance: Floats, status: str) -> PoseEstimate:
+        return replace(
+            self.single or PoseEstimate(status),
+            status=status,
+            world_from_rig=pose,
+            covariance=covariance,
+            found_by="sequence",
+        )

@@ -1,0 +1,190 @@
+"""Pose graph: the most probable poses of a piece of odometry, given the poses of single queries in it.
+
+The variables are all poses of the piece. Each odometry step is a relative pose with the covariance of its drift; each
+single query is a pose prior with its own covariance. Solved by GTSAM (F. Dellaert and GTSAM Contributors,
+https://gtsam.org).
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from toolkit import geometry
+from toolkit.errors import ManifestError
+from toolkit.geometry import Floats, Ints
+from toolkit.manifest import SequenceSettings
+from toolkit.sequences.odometry import (
+    Odometry,
+    PosedQueries,
+    cut,
+    first_guess,
+    fitted_scale,
+    floored,
+    place,
+    with_measured_drift,
+)
+
+MISSING = (
+    "The stage `sequence` needs GTSAM, which is not installed. To install it, run in the clone of the toolkit: "
+    "pip install -e '.[sequence]'"
+)
+_CHI2_999 = 22.46
+"""99.9 % quantile of the chi-squared distribution with 6 degrees of freedom."""
+_ROUNDS = 8
+"""Largest number of iterations of solving the graph and choosing the queries that fit."""
+MAX_STD_DEG, MAX_STD_M = 2.25, 0.2
+"""Largest standard deviation of an `ok` pose, over all axes: 5 degrees and 0.5 m are more than 2.2 times as much."""
+FAR = "low_confidence: odometry is not sure so far from a query"
+
+
+@dataclass(frozen=True)
+class PlacedPiece:
+    """The poses of one piece of odometry in the map."""
+
+    world_from_rig: Floats
+    """(N, 4, 4), NaN for frames without a pose: all frames if no query has a pose, online those without a query."""
+    covariances: Floats
+    """(N, 6, 6) of a small motion in the rig's frame: rotation, radians, then translation, meters."""
+    used: NDArray[np.bool_]
+    """(Q,) whether each query fits the poses; online, whether it fits the pose of its own frame."""
+    status: NDArray[np.object_]
+    """(N,) `ok`, `low_confidence: <reason>` or `failed: <reason>`; online empty for frames without a query."""
+    scale: float = 1.0
+    """Scale factor of the odometry; online that of the last pose."""
+
+
+def place_online(odometry: Odometry, queries: PosedQueries, frames: Ints, settings: SequenceSettings) -> PlacedPiece:
+    """Return the poses of some frames of a piece, each only from the last `settings.length_s` seconds before it.
+
+    Raises:
+        ManifestError: GTSAM is not installed.
+    """
+    length_us = np.inf if settings.length_s is None else settings.length_s * 1e6
+    count = len(odometry)
+    piece = PlacedPiece(
+        np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan), np.zeros(len(queries), bool),
+        np.full(count, "", object),
+    )  # fmt: skip
+    for frame in frames.tolist():
+        start = int(np.searchsorted(odometry.timestamps, odometry.timestamps[frame] - length_us))
+        within = slice(start, frame + 1)
+        past, chosen = odometry.part(within), queries.part(within)
+        drifting = with_measured_drift([(past, chosen)], settings)
+        last = cut(past, chosen, drifting)[-1]  # the part after the last loss of tracking
+        past, chosen = past.part(last), chosen.part(last)
+        placed = place_piece(past, chosen, drifting)
+        piece.world_from_rig[frame], piece.covariances[frame] = placed.world_from_rig[-1], placed.covariances[-1]
+        piece.status[frame] = placed.status[-1]
+        piece.used[queries.frames == frame] = placed.used[chosen.frames == len(past) - 1]
+        piece = replace(piece, scale=placed.scale)
+    return piece
+
+
+def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> PlacedPiece:
+    """Return the poses of a piece of odometry, from the poses of single queries in it.
+
+    Raises:
+        ManifestError: GTSAM is not installed.
+    """
+    count = len(odometry)
+    if not len(queries):
+        nothing = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan), np.zeros(0, bool)
+        return PlacedPiece(*nothing, np.full(count, "failed: no query of this piece has a pose", object))
+    best = place(odometry, queries, settings)[0]
+    used, seen = best.members, set[bytes]()
+    for _ in range(_ROUNDS):
+        chosen = queries.choose(used)
+        scale = fitted_scale(odometry, chosen, settings)
+        moved = odometry.scaled(scale)
+        poses, covariances = _optimized(moved, chosen, settings)
+        seen.add(used.tobytes())
+        # Use the queries that fit the solution, whether or not they voted for this placement.
+        fit = np.flatnonzero(_chi2(poses, covariances, queries) < _CHI2_999)
+        if not len(fit) or fit.tobytes() in seen:
+            break
+        used = fit
+    mask = np.isin(np.arange(len(queries)), used)
+    status = np.full(count, "ok", object)
+    if not best.trusted:
+        # `ok` queries that do not fit keep their own poses, because odometry may be what is wrong.
+        alone = queries.choose(queries.trusted & ~mask)
+        reason = "no query of this piece is sure"
+        if 2 * len(alone) > np.count_nonzero(queries.trusted):
+            reason = "odometry contradicts the queries"
+        elif best.rival_support >= 0.5 * best.support > 0:
+            reason = "another place is as likely"
+        status[:] = f"low_confidence: {reason}"
+        status[alone.frames], poses[alone.frames] = "ok", alone.world_from_rig
+        covariances[alone.frames] = floored(alone.covariances)
+    status[(status == "ok") & ~is_sure(covariances)] = FAR
+    return PlacedPiece(poses, covariances, mask, status, scale)
+
+
+def is_sure(covariances: Floats) -> NDArray[np.bool_]:
+    """Return which poses (n,) are certain enough for `ok`, from their covariances (n, 6, 6)."""
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    turns, shifts = variances[:, :3].sum(axis=1), variances[:, 3:].sum(axis=1)
+    return np.asarray((turns <= np.deg2rad(MAX_STD_DEG) ** 2) & (shifts <= MAX_STD_M**2))
+
+
+def _chi2(poses: Floats, covariances: Floats, queries: PosedQueries) -> Floats:
+    """Return squared Mahalanobis distances (Q,) of single poses to the graph's, under the sum of their covariances."""
+    frames = queries.frames
+    difference = geometry.small_motions(geometry.invert(poses[frames]) @ queries.world_from_rig)
+    total = floored(queries.covariances) + covariances[frames]
+    return np.asarray(np.einsum("qi,qi->q", difference, np.linalg.solve(total, difference[..., None])[..., 0]))
+
+
+def _optimized(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> tuple[Floats, Floats]:
+    """Solve the pose graph. Return world_from_rig (N, 4, 4) and covariances (N, 6, 6)."""
+    gtsam = require_gtsam()
+    graph, values = _motion_graph(odometry, queries, settings), gtsam.Values()
+    for number, pose in enumerate(first_guess(odometry, queries)):
+        values.insert(number, gtsam.Pose3(_rigid(pose)))
+    result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    marginals = gtsam.Marginals(graph, result)
+    numbers = range(len(odometry))
+    poses = np.stack([result.atPose3(number).matrix() for number in numbers])
+    return poses, np.stack([marginals.marginalCovariance(number) for number in numbers])
+
+
+def _motion_graph(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> Any:
+    """Return GTSAM's graph of N poses, with factors for odometry steps and poses of queries."""
+    gtsam = require_gtsam()
+    graph = gtsam.NonlinearFactorGraph()
+    steps = geometry.invert(odometry.odom_from_rig[:-1]) @ odometry.odom_from_rig[1:]
+    first: Ints = np.arange(len(steps))
+    rotation_std, position_std = odometry.drift(settings, first, first + 1)
+    # The scale also varies along the path.
+    position_std = np.hypot(position_std, settings.scale_std * np.linalg.norm(steps[:, :3, 3], axis=1))
+    # A device that stands still has no drift; the floor keeps the factors finite.
+    rotation_std, position_std = np.maximum(rotation_std, 1e-4), np.maximum(position_std, 1e-3)
+    for number, step in enumerate(steps):
+        noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([rotation_std[number], position_std[number]], 3))
+        graph.add(gtsam.BetweenFactorPose3(number, number + 1, gtsam.Pose3(_rigid(step)), noise))
+    kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(3.0)
+    for frame, pose, covariance in zip(queries.frames.tolist(), queries.world_from_rig, floored(queries.covariances),
+                                       strict=True):  # fmt: skip
+        noise = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Gaussian.Covariance(covariance))
+        graph.add(gtsam.PriorFactorPose3(frame, gtsam.Pose3(_rigid(pose)), noise))
+    return graph
+
+
+def _rigid(pose: Floats) -> Floats:
+    """Return a pose (4, 4) with an exact rotation; rotations in files are rounded."""
+    return geometry.pose_from_qt(geometry.qt_from_pose(pose))
+
+
+def require_gtsam() -> Any:
+    """Import and return GTSAM.
+
+    Raises:
+        ManifestError: it is not installed.
+    """
+    try:
+        import gtsam
+    except ImportError:
+        raise ManifestError(MISSING) from None
+    return gtsam
