@@ -160,6 +160,7 @@ def test_a_failed_query_says_why_and_is_drawn(small_capture: Path, tmp_path: Pat
     assert "no pose" in text_of(one.figure)
     assert picture_of(one).width > 800
     assert "no references" in pair.look(1).reason
+    assert "no reference" in text_of(pair.look(1).figure)
 
 
 def test_rivals_are_drawn_where_they_are(small_capture: Path, tmp_path: Path) -> None:

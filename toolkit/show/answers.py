@@ -139,7 +139,7 @@ class Answer:
     def true_pose(self) -> Floats | None:
         """world_from_rig (4, 4); None if unknown."""
         queries = self.pair.localizations
-        true = (queries.true @ queries.cam_from_rig)[self.number]
+        true = queries.true[self.number] @ queries.cam_from_rig[self.number]
         return true if is_posed(true) else None
 
     @property
@@ -193,6 +193,7 @@ def _is_by_network(method: str) -> bool:
 
 def _digits(value: float) -> str:
     """Return a number with two significant digits if it is small: an error below a millimeter is not 0.000 m."""
+    value = round(value, 9)  # what is smaller is rounding
     return np.format_float_positional(value, 2, fractional=False, trim="-") if value < 0.1 else number(value)
 
 

@@ -183,9 +183,9 @@ class InspectedPair:
         numbers = {name: float(found[name]) for name in LABELS if name in found and np.isfinite(found[name])}
         if "position_std_m" in numbers:
             numbers["position_std_m"] /= self.localized.unit[1]
-        covariance = found["covariance"]
+        covariance, (stated, method) = found["covariance"], (str(found.get(name, "")) for name in ("reason", "method"))
         return Inspection(
-            self.localized, number, str(found["status"]), str(found.get("reason", "")), str(found["method"]), numbers,
+            self.localized, number, str(found["status"]), stated, method, numbers,
             localized, pose if pose is not None and is_posed(pose) else None,
             covariance if covariance is not None and np.isfinite(covariance).all() else None,
             settings, float(found.get("seconds", np.nan)), self._retrieved(number), of=self,

@@ -112,6 +112,7 @@ def _draw_from_above(axis: "Axes", answers: Sequence[Answer]) -> None:
     points = sure_points(answer.pair.local_map)[0]
     points = points[:: len(points) // MAX_POINTS + 1]
     references = np.array([image.world_from_cam for image in answer.details.references]).reshape(-1, 4, 4)
+    references = references[is_posed(references)]
     shown = _cameras_of(answers)
     rivals = [(rival.world_from_rig @ answer.rig_from_cam, rival.support) for rival in answers[-1].rivals or ()]
     layers = [
@@ -127,8 +128,9 @@ def _draw_from_above(axis: "Axes", answers: Sequence[Answer]) -> None:
     centers = ground.flat(np.array([pose for pose, _, _ in named]).reshape(-1, 4, 4))
     places = Places(ground.flat(cameras))
     anchor = np.concatenate([ground.flat(pose[None]) for pose, _, _ in shown[:1]] + [ground.flat(references)])[:1]
-    place = int(places.nearest(anchor)[0]) if len(anchor) else 0
-    contents = np.concatenate([places.contents(place, ground.flat(points), anchor[:0]), ground.flat(references)])
+    place = int(places.nearest(anchor)[0]) if len(anchor) else None
+    contents = places.contents(place, ground.flat(points), anchor[:0]) if place is not None else places.cameras
+    contents = np.concatenate([contents, ground.flat(references)])
     # What lies farther away than the map is large is named, not drawn.
     low, high = window_of(contents, margin=1.0)
     near = centers[((centers > low) & (centers < high)).all(axis=1)]
