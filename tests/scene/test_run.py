@@ -10,7 +10,8 @@ from toolkit.files import SceneFiles
 from toolkit.scene import Run
 
 
-def test_a_run_has_its_settings_maps_and_queries(small_run: Path) -> None:
+@pytest.mark.slow
+def test_a_run_has_its_settings_maps_and_queries(small_run: Path, released_weights: None) -> None:
     run = Run.open(small_run)
     assert run.scenes == ["SMALL"]
     assert run.settings["name"] == small_run.name
@@ -26,8 +27,13 @@ def test_a_run_has_its_settings_maps_and_queries(small_run: Path) -> None:
     )
 
 
-def test_what_is_no_run_names_those_beside_it(small_run: Path) -> None:
-    with pytest.raises(ArtifactError, match=small_run.name):
-        Run.open(small_run.with_name(small_run.name[:-1]))
-    with pytest.raises(ArtifactError, match="SMALL"):
-        Run.open(small_run).map("ios", "OTHER")
+def test_what_is_no_run_names_those_beside_it(tmp_path: Path) -> None:
+    for name in ("fox", "castle"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "run.json").write_text("{}")
+    with pytest.raises(ArtifactError, match="fox"):
+        Run.open(tmp_path / "fos")
+    run = Run.open(tmp_path / "fox")
+    assert run.queries.empty
+    with pytest.raises(ArtifactError, match="found the scenes none"):
+        run.map("ios")
