@@ -135,7 +135,7 @@ def test_learned_features_find_what_sift_is_not_sure_of(
     settings = {"compute_device": "cpu"}
     places = (files.retrieval_dir, files.poses_dir, files.features, files.maps)
     table = localize_pairs(sessions, *places, settings, map_device="ios", query_device="ios")
-    assert 2 <= table["escalated"].item() <= 6
+    assert 1 <= table["escalated"].item() <= 6
     assert table["ok"].item() == table["queries"].item() == 25
     session = Capture.from_sessions_root(sessions)["ios_query"]
     poses = Trajectory.read(files.poses_txt("ios", "ios"))
