@@ -170,12 +170,13 @@ class Survey:
             )
             if fits or (share < 0.5 and too_coarse):
                 return replace(result, verdict="inconsistent", fits=fits)
-        noise = self.noise(local_map.length)
+        pairs = self._pairs
+        noise = pairs.noise(local_map.length)
         return replace(
             result,
             verdict="consistent",
             wrong=self._wrong_images(local_map),
-            camera=self._pairs.misfit(self.images.cameras),
+            camera=pairs.misfit(self.images.cameras),
             rotation_noise_deg=round(noise.rotation_deg, 4),
             position_noise=round(noise.position, 6),
             direction_noise_deg=round(noise.direction_deg(self.typical_depth() / local_map.length), 4),
