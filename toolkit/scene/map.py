@@ -51,6 +51,7 @@ from toolkit.prediction.feed_forward import FeedForwardLocalizer
 from toolkit.prediction.hybrid import HybridLocalizer
 from toolkit.prediction.interface import Predictor
 from toolkit.prediction.registry import open_predictor
+from toolkit.runs.record import RECORD
 from toolkit.store.hdf5 import HDF5_ERRORS
 
 log = logging.getLogger(__name__)
@@ -118,9 +119,9 @@ class Map:
             path = map_path(map_dir, session.id, kind.name)
             assert settings.map is not None
             metric = settings.unit is not None
-            first = mapped[0].map.poses if mapped and settings.map.refine_poses else None
             local_map = build_map(
-                session, store, path, settings.map, settings.seed, skip_existing, inputs, workers, metric, first
+                session, store, path, settings.map, settings.seed, skip_existing, inputs, workers, metric,
+                map_.refined_poses or None,
             )
             mapped.append(MappedFeatures(local_map, store, KINDS[kind.name], kind.matcher, kind.name))
         if mapped and map_.remarks:
@@ -241,6 +242,12 @@ class Map:
     def consistency(self) -> Consistency:
         """How well the poses of the map agree with its images; unknown if the map has no points."""
         return self.mapped[0].map.consistency if self.mapped else Consistency()
+
+    @property
+    def refined_poses(self) -> dict[str, Floats]:
+        """Pose (4, 4) of each map image by its name, if the map was built with refined poses; else empty."""
+        refined = self.mapped and self.settings.map is not None and self.settings.map.refine_poses
+        return self.mapped[0].map.poses if refined else {}
 
     @property
     def length(self) -> float:
@@ -487,12 +494,22 @@ class Map:
         return rows[order], inliers[order]
 
 
+def no_such_run(run: Path) -> str:
+    """Return a message that lists the runs beside a folder that is none."""
+    return f"{run}: no such run. {nearest(run.name, [path.parent.name for path in run.parent.glob(f'*/{RECORD}')])}"
+
+
+def localized_scenes(run: Path) -> list[str]:
+    """Return the names of the captures that a run has localized, in order."""
+    return sorted(path.parent.name for path in run.glob("*/poses"))
+
+
 def _unknown(files: SceneFiles, device: str) -> str:
     """Return a message that says which of run, scene and device is unknown, and lists the known ones."""
     run = files.run
     if not run.is_dir():
-        return f"{run}: no such run. {nearest(run.name, [path.parent.name for path in run.parent.glob('*/run.json')])}"
-    scenes = [path.parent.name for path in run.glob("*/poses")]
+        return no_such_run(run)
+    scenes = localized_scenes(run)
     if files.scene not in scenes:
         return f"{run}: no poses of the scene {files.scene!r}. {nearest(files.scene, scenes)}"
     devices = {pair_devices(path.stem)[0] for path in files.poses_dir.glob("*.h5")}
@@ -632,9 +649,8 @@ def _on_demand(
 
     `names` are the names of its images; None: all map images with a pose.
     """
-    refined = map.mapped[0].map.poses if map.mapped and settings.map and settings.map.refine_poses else {}
     return OnDemandLocalizer(
-        PosedImages.of_session(map.session, names, map.length, refined),
+        PosedImages.of_session(map.session, names, map.length, map.refined_poses),
         map.in_lengths,
         [(kind, partial(lambda kind, name: map.on_demand(kind)(name), kind)) for kind in kinds],
         settings.map,

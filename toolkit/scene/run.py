@@ -10,9 +10,8 @@ import pandas as pd
 from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles, of_sequence, pair_devices, read_json
-from toolkit.manifest import nearest
 from toolkit.runs.record import RECORD
-from toolkit.scene.map import Map
+from toolkit.scene.map import Map, localized_scenes, no_such_run
 
 
 @dataclass(frozen=True)
@@ -30,8 +29,7 @@ class Run:
         """
         path = Path(path)
         if not (path / RECORD).is_file():
-            known = [record.parent.name for record in path.parent.glob(f"*/{RECORD}")]
-            raise ArtifactError(f"{path}: no such run. {nearest(path.name, known)}")
+            raise ArtifactError(no_such_run(path))
         return cls(path)
 
     @cached_property
@@ -47,7 +45,7 @@ class Run:
     @cached_property
     def scenes(self) -> list[str]:
         """Names of the captures that were localized."""
-        return sorted(folder.parent.name for folder in self.path.glob("*/poses"))
+        return localized_scenes(self.path)
 
     def map(self, device: str, scene: str | None = None) -> Map:
         """Open the map of a device, see `Map.open`.
@@ -68,12 +66,12 @@ class Run:
         Raises:
             ArtifactError: a table is damaged.
         """
-        tables = [pd.DataFrame({"scene": [], "map_device": [], "query_device": [], "status": []})]
+        keys, tables = ("scene", "map_device", "query_device"), list[pd.DataFrame]()
         for scene in self.scenes:
             for path in sorted(SceneFiles(self.path, scene).poses_dir.glob("*.csv")):
                 if not of_sequence(path.stem):
-                    devices = dict(zip(("map_device", "query_device"), pair_devices(path.stem), strict=True))
                     table = read_query_table(path, ["status"])
-                    tables.append(table.assign(scene=scene, **devices))
-        table = pd.concat(tables, ignore_index=True)
-        return table[[*tables[0].columns[:3], *table.columns.difference(tables[0].columns[:3], sort=False)]]
+                    for column, value in enumerate((scene, *pair_devices(path.stem))):
+                        table.insert(column, keys[column], value)
+                    tables.append(table)
+        return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=[*keys, "status"])
