@@ -38,7 +38,6 @@ BINS = (0.0, 0.1, 0.5, 0.9, 0.99, 1.0)
 DEGRADATIONS = ("none", "dark", "blurred", "fog", "hidden", "dark, hidden")
 
 Image = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 
 
 class Way(NamedTuple):
@@ -121,13 +120,16 @@ def harden(capture: Path, copy: Path, way: Way, seed: int) -> None:
 
 def _longer(line: str, factor: float) -> str:
     """Return a line of sensors.txt, a camera's focal lengths times a factor."""
-    fields = [field.strip() for field in line.strip().split(",")]
-    if fields[0].startswith("#") or fields[2] != "camera":
+    from toolkit.capture.cameras import camera_text, parse_camera
+
+    if line.startswith("#") or line.split(",")[2].strip() != "camera":
         return line
-    both = not fields[3].startswith("SIMPLE_") and fields[3] not in ("RADIAL", "RADIAL_FISHEYE")
-    for column in (6, 7)[: 1 + both]:
-        fields[column] = repr(float(fields[column]) * factor)
-    return ", ".join(fields) + "\n"
+    sensor_id, name, kind, params = line.split(",", 3)
+    camera = parse_camera(kind.strip(), params)
+    scale = np.ones(len(camera.params))
+    scale[camera.focal_length_idxs()] = factor
+    camera.params = scale * camera.params
+    return f"{sensor_id},{name},{kind}, {camera_text(camera)}\n"
 
 
 def localize(capture: Path, run: Path, defaults: bool) -> None:
