@@ -47,8 +47,8 @@ def result(run: Path, sessions_root: Path) -> bytes:
 
     from PIL import Image
 
+    from toolkit.figures import style as figures
     from toolkit.files import SceneFiles
-    from toolkit.show import figures
     from toolkit.visualize import visualize_scene
 
     files, pair = SceneFiles(run, run.name), f"{run.name}_map_hl_query_ios"

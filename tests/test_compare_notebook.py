@@ -7,7 +7,7 @@ from pathlib import Path
 import nbformat
 import pytest
 
-from tests.show.test_comparison import GOOD, LOST, PAIRS, write_run
+from tests.report.test_comparison import GOOD, LOST, PAIRS, write_run
 from toolkit.__main__ import main
 from toolkit.notebook import NOTEBOOKS, handed_counts, notebook_parameters
 

@@ -10,11 +10,11 @@ from tests.test_embed import write_tiny_capture
 from toolkit.capture import Trajectory
 from toolkit.embed import embed_sessions
 from toolkit.evaluate import draw_evaluation, evaluate_scene
+from toolkit.figures.explore import draw_references, draw_reranked, draw_similarity, draw_statuses
 from toolkit.files import SceneFiles, read_references
 from toolkit.localize import localize_pairs
 from toolkit.rerank import rerank_pairs
 from toolkit.retrieve import retrieve_pairs
-from toolkit.show.explore import draw_references, draw_reranked, draw_similarity, draw_statuses
 from toolkit.visualize import visualize_scene
 
 KEYFRAMES = "proc/keyframes_pruned_subsampled.txt"

@@ -16,7 +16,7 @@ import pandas as pd
 import pytest
 
 from tests.conftest import REPOSITORY
-from tests.show.test_recordings import read_back
+from tests.viewer.test_sessions import read_back
 from toolkit.store.items import Items
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="needs fork and SIGKILL")]

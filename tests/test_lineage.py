@@ -16,6 +16,8 @@ from toolkit.errors import ArtifactError, ManifestError
 from toolkit.evaluate import evaluate_scene
 from toolkit.exchange.export import export_colmap, export_pairs, export_poses
 from toolkit.exchange.submission import collect
+from toolkit.figures.inspection import inspect_query
+from toolkit.figures.retrieval import RetrievedPair
 from toolkit.files import (
     SceneFiles,
     changed_sources,
@@ -28,11 +30,9 @@ from toolkit.files import (
     write_sidecar,
 )
 from toolkit.notebook import notebook_path
+from toolkit.report.comparison import compare_runs
+from toolkit.report.page import write_report
 from toolkit.scene.map import Map
-from toolkit.show.comparison import compare_runs
-from toolkit.show.inspection import inspect_query
-from toolkit.show.report import write_report
-from toolkit.show.retrieval import RetrievedPair
 from toolkit.visualize import visualize_scene
 
 

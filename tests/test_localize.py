@@ -37,6 +37,7 @@ from toolkit.features.features import KINDS, LocalFeatures
 from toolkit.features.matching import MATCHERS, LocalMethod, MutualMatcher, unit_descriptors
 from toolkit.features.sift import SiftExtractor, SiftSettings
 from toolkit.features.stores import extract_session
+from toolkit.figures.inspection import InspectedPair
 from toolkit.files import SceneFiles, image_name, map_record_path, read_map_record, read_references, sidecar_path
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
 from toolkit.manifest import EmbedSettings, LocalizeSettings
@@ -55,7 +56,6 @@ from toolkit.scene import create_localizer
 from toolkit.scene import map as maps
 from toolkit.scene.locate import pixels_from
 from toolkit.sequence import sequence_pairs
-from toolkit.show.inspection import InspectedPair
 
 LIST = "keyframes_original"
 DEVICES = ("ios", "hl", "spot")

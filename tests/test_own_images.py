@@ -14,10 +14,10 @@ import pytest
 from toolkit.capture import Session, Trajectory
 from toolkit.errors import CaptureError, ManifestError, StageError
 from toolkit.exchange.interchange import import_images, import_once
+from toolkit.figures.explore import list_poses
 from toolkit.geometry import make_pose
 from toolkit.notebook import NOTEBOOKS, notebook_parameters, own_folder
 from toolkit.pipeline import execute
-from toolkit.show.explore import list_poses
 
 PATH = NOTEBOOKS / "00_own_images.ipynb"
 

@@ -10,8 +10,8 @@ from tests.localized import instants, some_correspondences, write_pair
 from toolkit import visualize
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, CaptureError
+from toolkit.figures.style import new_figure
 from toolkit.pose.correspondences import LocalizedQuery, query_group
-from toolkit.show.figures import new_figure
 from toolkit.visualize import sample_pictures, visualize_scene
 
 QUICK = {"session_recordings": False, "matched_queries": 2}

@@ -21,8 +21,9 @@ from nbformat.v4 import new_output
 
 # Imported before the first fork, all that the cells need.
 from toolkit import embed, evaluate, localize, notebook, pipeline, rerank, retrieve, visualize  # noqa: F401
+from toolkit.figures import explore  # noqa: F401
 from toolkit.files import write_atomic
-from toolkit.show import explore, report  # noqa: F401
+from toolkit.report import page  # noqa: F401
 
 CHANGES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}
 """Audit events that change a folder; `open` for writing is the other."""

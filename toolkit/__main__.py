@@ -166,7 +166,7 @@ def settings(stage: Annotated[str, typer.Argument(help="Only this stage, e.g. lo
 @app.command()
 def report(run_dir: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, for example runs/demo.")]) -> None:
     """Write the report of a run again from its folder."""
-    from toolkit.show.report import write_report
+    from toolkit.report.page import write_report
 
     print(f"Report: {write_report(run_dir)}")
 
@@ -459,7 +459,7 @@ def record(
     out: Annotated[Path | None, typer.Option(help="File to write, .rrd.")] = None,
 ) -> None:
     """Record a session for the rerun viewer: images on a timeline, cameras, depth and points."""
-    from toolkit.show.recordings import record_session
+    from toolkit.viewer.sessions import record_session
 
     rrd = record_session(
         scene, split, device, subsession, keyframes_only, every, spawn, vis_retrieve_queries, queries_pose,
@@ -502,7 +502,7 @@ def _compare(
 ) -> None:  # fmt: skip
     """Compare runs and print the result; execute the notebook on them, and write it as a page."""
     from toolkit.notebook import execute, notebook_path, write_page
-    from toolkit.show.comparison import compare_runs
+    from toolkit.report.comparison import compare_runs
 
     comparison = compare_runs(list(map(str, runs)), seed)
     if not as_json:

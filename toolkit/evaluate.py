@@ -16,6 +16,9 @@ from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.devices import in_order
 from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError, CaptureError, ToolkitError
+from toolkit.figures.evaluation import Evaluation, draw_evaluation
+from toolkit.figures.sequences import SequencePair
+from toolkit.figures.style import save_figure
 from toolkit.files import (
     map_record_path,
     pair_name,
@@ -28,11 +31,7 @@ from toolkit.files import (
 )
 from toolkit.geometry import Floats
 from toolkit.manifest import EvaluateSettings
-from toolkit.runs.pairs import LEFT_OUT, left_out
-from toolkit.show.evaluation import Evaluation, draw_evaluation
-from toolkit.show.figures import save_figure
-from toolkit.show.localized import load_maps, map_files
-from toolkit.show.metrics import (
+from toolkit.results.metrics import (
     NO_POSE,
     NO_REFERENCE,
     REASONS,
@@ -50,8 +49,9 @@ from toolkit.show.metrics import (
     threshold_name,
     unit_of,
 )
-from toolkit.show.overlap import LEAST_OVERLAP, overlap_in_view, seen_by
-from toolkit.show.sequences import SequencePair
+from toolkit.results.overlap import LEAST_OVERLAP, overlap_in_view, seen_by
+from toolkit.results.pair import load_maps, map_files
+from toolkit.runs.pairs import LEFT_OUT, left_out
 
 if TYPE_CHECKING:
     from toolkit.mapping.local_map import LocalMap

@@ -54,6 +54,7 @@ from toolkit.pose.pnp import PNP_FORMAT
 from toolkit.pose.stored_queries import localized_query, references_of_images, stored_query
 from toolkit.prediction.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.prediction.registry import open_predictor
+from toolkit.results.metrics import camera_messages
 from toolkit.runs.pairs import PairRows
 from toolkit.scene.locate import localize_image
 from toolkit.scene.map import (
@@ -66,7 +67,6 @@ from toolkit.scene.map import (
     session_fingerprint,
     update_attributes,
 )
-from toolkit.show.metrics import camera_messages
 from toolkit.store.hdf5 import write_groups
 from toolkit.store.items import Items, heals
 from toolkit.threads import fixed_sums

@@ -181,7 +181,7 @@ def readable(table: "pd.DataFrame", unit: str = "m") -> "pd.DataFrame":
     `localized`, the sum of `ok` and `low_confidence`. Columns of lengths end in their `unit`. Column names are
     shortened where the unit implies the quantity.
     """
-    from toolkit.show.metrics import named_by_unit
+    from toolkit.results.metrics import named_by_unit
 
     trivial = {"state": "evaluated", "reason": ""}
     dropped = [name for name, text in trivial.items() if name in table and (table[name] == text).all()]

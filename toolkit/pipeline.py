@@ -676,6 +676,6 @@ def _run_job(
 
 
 def _write_report(run_dir: Path) -> None:
-    from toolkit.show.report import write_report
+    from toolkit.report.page import write_report
 
     write_report(run_dir)

@@ -15,17 +15,17 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, DamagedError
+from toolkit.figures.sequences import SequencePair, draw_sequence
+from toolkit.figures.stills import WorstQuery, draw_localization, draw_scene, draw_worst
+from toolkit.figures.style import save_figure
 from toolkit.files import pair_name, require_current, sidecar_path, write_sidecar
 from toolkit.geometry import Floats
 from toolkit.manifest import VisualizeSettings
+from toolkit.results.metrics import is_posed, worst_first
+from toolkit.results.pair import LocalizedPair, support_of, sure_points
 from toolkit.runs.pairs import PairRows, left_out
-from toolkit.show.figures import save_figure
-from toolkit.show.localization_view import record_localizations
-from toolkit.show.localized import LocalizedPair, support_of, sure_points
-from toolkit.show.metrics import is_posed, worst_first
-from toolkit.show.recordings import record_session, session_tracks
-from toolkit.show.sequences import SequencePair, draw_sequence
-from toolkit.show.stills import WorstQuery, draw_localization, draw_scene, draw_worst
+from toolkit.viewer.queries import record_localizations
+from toolkit.viewer.sessions import record_session, session_tracks
 
 WORST = 10
 """Queries on the sheet of the worst queries of all pairs."""

@@ -17,10 +17,10 @@ from toolkit.embedders.index import JoinedIndex, VectorIndex
 from toolkit.embedders.search import fuse, search
 from toolkit.embedders.stored import JoinedVectors, open_descriptors
 from toolkit.errors import ArtifactError, ManifestError, WeightsError
+from toolkit.figures.explore import draw_similarity
 from toolkit.geometry import unit
 from toolkit.manifest import EmbedSettings
 from toolkit.retrieve import retrieve_pairs
-from toolkit.show.explore import draw_similarity
 
 DIMS = (6, 9)
 

@@ -18,6 +18,8 @@ from toolkit import geometry
 from toolkit import localize as localize_stage
 from toolkit.capture import Capture, Trajectory
 from toolkit.errors import ImageError, ManifestError, WeightsError
+from toolkit.figures.prediction import draw_prediction
+from toolkit.figures.style import save_figure
 from toolkit.files import SceneFiles
 from toolkit.localize import COLUMNS, PREDICTION_COLUMNS
 from toolkit.pose.base import PoseEstimate, QueryInput, References, View
@@ -29,8 +31,6 @@ from toolkit.prediction.feed_forward import (
 )
 from toolkit.prediction.interface import Prediction
 from toolkit.prediction.simulated import SimulatedPredictor
-from toolkit.show.figures import save_figure
-from toolkit.show.visualize_prediction import draw_prediction
 from toolkit.store.items import Items
 
 Floats = NDArray[np.float64]

@@ -1,0 +1,291 @@
+"""One query of a run under the glass: it shows what was stored, and localizes again as the run did."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.displayed import picture_of
+from tests.localized import some_correspondences, write_pair
+from tests.rendered import LIST, copy_shared, write_retrieval
+from toolkit.capture import Capture
+from toolkit.errors import ArtifactError, ManifestError
+from toolkit.figures.answers import reason_in_words
+from toolkit.figures.choice import Choice, choose, find_query, shown_name
+from toolkit.figures.inspection import Comparison, InspectedPair, WorstQueries, inspect_query
+from toolkit.figures.inspection_view import _position_covariance
+from toolkit.files import SceneFiles, map_record_path
+from toolkit.geometry import invert
+from toolkit.localize import localize_pairs
+from toolkit.manifest import LocalizeSettings
+from toolkit.pose.correspondences import LocalizedQuery, Rival
+
+
+@pytest.fixture(scope="module")
+def files(
+    small_capture: Path, small_features: Path, made_once: Callable[[str, Callable[[Path], object]], Path]
+) -> SceneFiles:
+    """A run that has localized the robot's rig in the phone's map by PnP; do not write to it."""
+
+    def make(folder: Path) -> None:
+        files = SceneFiles(folder, small_capture.name)
+        copy_shared(small_features, files.features)
+        capture = Capture.open(small_capture)
+        write_retrieval(files.retrieval("ios", "spot"), capture["ios_map"], capture["spot_query"])
+        folders = files.retrieval_dir, files.poses_dir, files.features, files.maps
+        devices = {"map_device": "ios", "query_device": "spot"}
+        localize_pairs(small_capture / "sessions", *folders, queries=LIST, workers=1, **devices)
+
+    return SceneFiles(made_once("inspected", make), small_capture.name)
+
+
+@pytest.fixture(scope="module")
+def pair(files: SceneFiles) -> InspectedPair:
+    return InspectedPair("ios", "spot", files.poses_dir)
+
+
+def written(
+    capture: Path, folder: Path, queries: list[LocalizedQuery], device: str = "ios", **columns: object
+) -> InspectedPair:
+    """A pair written by hand, its attributes like those of a run."""
+    import h5py
+
+    from toolkit.scene.map import RETRIEVAL, SESSIONS_ROOT, SETTINGS
+
+    poses = folder / capture.name / "poses"
+    stem = write_pair(Capture.open(capture), poses, "ios", device, queries, **columns)  # type: ignore[arg-type]
+    with h5py.File(f"{stem}.h5", "a") as file:
+        file.attrs[SETTINGS] = LocalizeSettings(world_up=[0.0, 0.0, 1.0]).model_dump_json()
+        file.attrs[SESSIONS_ROOT] = str(capture / "sessions")
+        file.attrs[RETRIEVAL] = str(folder / capture.name / "retrieval")
+    return InspectedPair("ios", device, poses)
+
+
+def text_of(figure: object) -> str:
+    return "\n".join(text.get_text() for text in figure.findobj(lambda artist: hasattr(artist, "get_text")))  # type: ignore[attr-defined]
+
+
+def panel(figure: object, title: str) -> object:
+    return next(axis for axis in figure.axes if axis.get_title().startswith(title))  # type: ignore[attr-defined]
+
+
+def test_it_shows_what_the_stage_stored(files: SceneFiles, pair: InspectedPair) -> None:
+    one = inspect_query(files.run, files.scene, "ios", "spot", 1)
+    row = pd.read_csv(files.poses_csv("ios", "spot")).iloc[1]
+    stored = pair.localized.queries[int(row["timestamp"]), row["device_id"]]
+    assert one.status == row["status"]
+    assert one.numbers["num_inliers"] == row["num_inliers"]
+    assert one.matches["agree"].sum() == stored.correspondences.inlier.sum() > 0
+    assert one.matches.to_numpy().sum() == len(stored.correspondences)
+    assert one.error[1] == pytest.approx(np.linalg.norm((invert(one.pose) @ one.true_pose)[:3, 3])), "of the rig"
+    assert one.references["name"][one.references["used"]].tolist() == stored.references
+    ranked = one.references.dropna(subset="rank")
+    assert ranked["rank"].min() == 1
+    assert ranked.sort_values("rank")["score"].notna().all()
+    shown = text_of(one.figure)
+    for kind, counts in one.matches.iterrows():
+        assert counts["agree"] == 0 or f"{str(kind).replace('/', ', ')}: {counts['agree']} agree" in shown
+    assert one.status in shown
+    assert f"\n{one.name.partition('/raw_data/')[2]}\n" in shown
+    assert f"{row['num_inliers']}" in shown
+    assert one.texts["true position error [m]"].strip("0.")
+    assert picture_of(one).width > 800
+
+
+@pytest.mark.slow
+def test_unchanged_settings_give_the_same_pose_and_others_are_shown_beside(pair: InspectedPair) -> None:
+    one = pair.look(0)
+    same = one.again()
+    assert same.after.pose is not None
+    np.testing.assert_allclose(same.after.pose, one.pose, atol=1e-12)
+    np.testing.assert_allclose(same.after.covariance, one.covariance, rtol=1e-9)
+    assert same.after.status == one.status
+    assert len(same.after.correspondences) == len(one.correspondences)
+    assert (same.after.rivals, one.rivals) == ((), ())
+    strict = one.again({"pnp": {"min_inliers": 5000}})
+    assert strict.after.status.startswith("failed: too few inliers")
+    assert "at least 5000 are required" in strict.after.reason
+    assert strict.before is one
+    assert strict.table.loc["status"].tolist() == [one.status, strict.after.status]
+    assert picture_of(strict).width > 800
+    nearest = one.again({"method": "nearest"})
+    assert nearest.after.method == "nearest"
+    first = one.references[one.references["rank"] == 1]  # one of each camera of the rig
+    assert nearest.after.localized.references == [first["name"][first["score"].idxmax()]]
+    alone = text_of(nearest.after.figure)
+    assert "true position error" in alone
+    assert not any(text in alone for text in ("inliers", "descriptor matches", "image covered")), "it has none"
+    with pytest.raises(ManifestError, match=r"max_keypoints|features: found other settings"):
+        one.again({"features": {"max_keypoints": 500}})
+    with pytest.raises(ManifestError, match="min_inliers"):
+        one.again({"pnp": {"min_inlier": 5}})
+
+
+def test_the_worst_is_the_worst(small_capture: Path, tmp_path: Path) -> None:
+    off = [0.0, 0.3, 0.02]
+    pair = written(small_capture, tmp_path, [LocalizedQuery()] * 3, off_m=off)
+    assert pair.look("worst").number == 1
+    assert pair.look(1).error[1] == pytest.approx(0.3)
+    worst = WorstQueries(pair._h5.parent)
+    assert [worst.look(rank).number for rank in range(3)] == [1, 2, 0]
+    assert worst.names[0] == f"ios in the map of ios: {shown_name(pair.names[1])}"
+    with pytest.raises(ArtifactError, match="to 2"):
+        worst.look(3)
+    assert WorstQueries(tmp_path).names == []
+
+
+def test_a_session_that_broke_after_a_run_costs_only_its_own_pairs(small_capture: Path, tmp_path: Path) -> None:
+    capture = tmp_path / "capture" / small_capture.name
+    shutil.copytree(small_capture, capture)
+    written(capture, tmp_path, [LocalizedQuery()] * 2)
+    pair = written(capture, tmp_path, [LocalizedQuery()], device="hl")
+    (capture / "sessions" / "hl_query" / "images.txt").write_text("a line\n")
+    worst = WorstQueries(pair._h5.parent)
+    assert [name.partition(":")[0] for name in worst.names] == ["ios in the map of ios"] * 2
+
+
+def test_a_failed_query_says_why_and_is_drawn(small_capture: Path, tmp_path: Path) -> None:
+    status = ["failed: too few inliers (4 within 0.45 deg)", "failed: no references"]
+    counts = {"num_inliers": [4, 0], "num_matches": [9, 0]}
+    pair = written(small_capture, tmp_path, [LocalizedQuery()] * 2, status=status, **counts)
+    one = pair.look(0)
+    assert one.pose is None
+    assert one.error is None
+    assert all(count in one.reason for count in ("4 within 0.45 deg", "9 matches", "at least 12"))
+    assert "no pose" in text_of(one.figure)
+    assert picture_of(one).width > 800
+    assert "no references" in pair.look(1).reason
+    assert "no reference" in text_of(pair.look(1).figure)
+
+
+def test_rivals_are_drawn_where_they_are(small_capture: Path, tmp_path: Path) -> None:
+    session = Capture.open(small_capture)["ios_query"]
+    pose = session.world_from_cam([0], ground_truth=True)[0].copy()
+    pose[:3, 3] += [0.5, 0.0, 0.0]
+    found = some_correspondences([0] * 6, [True, False, True, True, False, True])
+    query = LocalizedQuery([session.image_name(0)], [], [], found, (Rival(pose, 0.93),))
+    one = written(small_capture, tmp_path, [query]).look(0)
+    drawn = {each.get_label(): each.get_offsets() for each in panel(one.figure, "from above").collections}
+    np.testing.assert_allclose(drawn["rival, 93% of the support"], [pose[:2, 3]], atol=1e-9)
+    assert one.matches.loc["sift/descriptors"].tolist() == [4, 2]
+
+
+def test_the_ellipse_is_of_the_camera_not_of_the_rig(pair: InspectedPair) -> None:
+    one = pair.look(0)
+    rig_from_cam = one.pair.query_session.rig_from_cam(one.pair.rows[0])
+    names = [one.pair.query_session.image_name(int(row)) for row in one.pair.rows[0]]
+    camera = names.index(one.details.cameras[0].name)
+    rng = np.random.default_rng(0)
+    moves = rng.multivariate_normal(np.zeros(6), one.covariance, 20_000)
+    at = rig_from_cam[camera][:3, 3]
+    places = at + moves[:, 3:] + np.cross(moves[:, :3], at)
+    expected = np.cov((places @ one.pose[:3, :3].T).T)
+    covariance = _position_covariance(one, rig_from_cam[camera])
+    np.testing.assert_allclose(covariance, expected, atol=0.05 * np.abs(expected).max())
+
+
+def test_both_answers_are_drawn_at_the_same_camera_of_a_rig(pair: InspectedPair) -> None:
+    one = pair.look(0)
+    other = next(image.name for image in one.details.cameras if image.name != one.details.cameras[0].name)
+    found = some_correspondences([one.localized.images.index(other)] * 6, [True] * 6)
+    swapped = replace(one, localized=replace(one.localized, correspondences=found))
+    assert swapped.details.cameras[0].name == other
+    first, second = panel(Comparison(one, swapped, {}).figure, "the pose, enlarged").patches
+    np.testing.assert_allclose(second.get_center(), first.get_center(), atol=1e-9)
+
+
+def test_lengths_of_an_unknown_unit_are_not_meters(small_capture: Path, tmp_path: Path) -> None:
+    off = [0.0, 0.3, 0.02]
+    pair = written(small_capture, tmp_path, [LocalizedQuery()] * 3, off_m=off, position_std_m=[0.01, 0.2, 0.03])
+    poses = pair._h5.parent
+    map_record_path(poses, small_capture.name, "ios").write_text(json.dumps({"unit": None, "depth": 50.0, "text": ""}))
+    pair = InspectedPair("ios", "ios", poses)
+    one = pair.look("worst")
+    assert one.error[1] == pytest.approx(0.06)
+    assert one.numbers["position_std_m"] == pytest.approx(0.04)
+    text = text_of(one.figure)
+    assert "std. dev. of position [L]" in text
+    assert "[m]" not in text
+
+
+def test_what_is_not_known_is_not_shown(files: SceneFiles, small_capture: Path, tmp_path: Path) -> None:
+    capture = Path(shutil.copytree(small_capture, tmp_path / small_capture.name))
+    for truth in (capture / "sessions" / "spot_query").rglob("*trajector*"):
+        truth.unlink()
+    one = InspectedPair("ios", "spot", files.poses_dir, sessions_root=capture / "sessions").look(0)
+    assert one.true_pose is None
+    assert one.error is None
+    assert "true" not in text_of(one.figure)
+
+
+def test_names_and_numbers_that_are_none_are_refused(files: SceneFiles, pair: InspectedPair, tmp_path: Path) -> None:
+    name = pair.localized.query_session.image_name(int(pair.localized.rows[2][-1]))
+    for same in (name, name.partition("raw_data/")[2], f"SMALL/sessions/{name}"):
+        assert pair.look(same).number == 2
+    with pytest.raises(ArtifactError, match=f"The nearest of its .* images is '{name}'"):
+        pair.look(name.replace("raw_data", "raw_dat"))
+    with pytest.raises(ArtifactError, match=f"expected a number from 0 to {len(pair) - 1}"):
+        pair.look(len(pair))
+    with pytest.raises(ArtifactError, match=r"expected a number or the name of an image"):
+        pair.look(1.5)  # type: ignore[arg-type]
+    with pytest.raises(ArtifactError, match="2 queries have an image name that ends in"):
+        find_query("b.jpg", {"x/b.jpg": 0, "y/b.jpg": 1, "y/ab.jpg": 2}, 3)
+    with pytest.raises(ArtifactError, match=r"no correspondences of queries of 'spt'.*Did you mean .*spot"):
+        inspect_query(files.run, files.scene, "ios", "spt", 0)
+    with pytest.raises(ArtifactError, match="no correspondences"):
+        InspectedPair("ios", "spot", tmp_path)
+    with pytest.raises(ArtifactError, match=r"no poses of the scene 'SMAL'.*Known: SMALL"):
+        inspect_query(files.run, "SMAL", "ios", "spot", 0)
+
+
+def test_an_estimate_in_doubt_says_why() -> None:
+    numbers = {"num_inliers": 20, "num_matches": 80, "inlier_ratio": 0.25, "coverage": 0.2, "p_correct": 0.7}
+    words = reason_in_words("low_confidence", "", numbers | {"rival_support": 0.93}, LocalizeSettings())
+    assert all(share in words for share in ("70%", "99%", "93%")), "its probability, the limit, and the rival"
+    camera = reason_in_words("low_confidence: camera?", "the focal length is 500 px", numbers, LocalizeSettings())
+    assert camera.endswith("The focal length is 500 px.")
+
+
+def test_a_list_chooses_what_is_shown(pair: InspectedPair, monkeypatch: pytest.MonkeyPatch) -> None:
+    import IPython.display
+    import ipywidgets
+
+    from toolkit.runs.kernel import TEXT_BARS
+
+    class Handle:
+        def update(self, shown: object, **more: object) -> None:
+            outputs.append(shown)
+
+    outputs: list[object] = []
+
+    def display(shown: object, **more: object) -> Handle:
+        outputs.append(shown)
+        return Handle()
+
+    monkeypatch.setattr(IPython.display, "display", display)
+    monkeypatch.delenv(TEXT_BARS, raising=False)
+    choice = choose(pair, 1)
+    listed, first = outputs
+    assert isinstance(listed, ipywidgets.Dropdown)
+    assert listed.options[2][0] == f"2: {shown_name(pair.names[2])}"
+    assert (first.number, listed.value) == (1, 1)  # type: ignore[attr-defined]
+    listed.value = 2
+    assert outputs[-1] is choice.shown
+    assert choice.shown.number == 2
+    monkeypatch.setenv(TEXT_BARS, "1")
+    outputs.clear()
+    choose(pair, pair.names[0])
+    assert [type(shown).__name__ for shown in outputs] == ["Inspection"]
+
+
+def test_asking_in_a_notebook_does_not_end_it(
+    capsys: pytest.CaptureFixture[str], pair: InspectedPair
+) -> None:
+    Choice(pair.look(0)).attempt(lambda query: query.again({"features": {"max_keypoints": 5}}))
+    assert "features" in capsys.readouterr().out
+    Choice(None).attempt(lambda query: pytest.fail("there is none"))

@@ -1,0 +1,1 @@
+"""Figures: one function or class for each, for notebooks and PNG files."""

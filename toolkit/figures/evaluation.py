@@ -1,0 +1,303 @@
+"""The tables of an evaluation and their figures."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from toolkit.capture.devices import color_of, in_order
+from toolkit.figures.sequences import draw_steps
+from toolkit.figures.style import ORANGE, SKY, VERMILLION, new_figure, number, percent, plain_log, styled
+from toolkit.results.metrics import (
+    REASONS,
+    THRESHOLDS,
+    WRONG,
+    Threshold,
+    is_below,
+    parse_threshold,
+    small_unit,
+    threshold_name,
+    unit_of,
+)
+from toolkit.runs.pairs import LEFT_OUT
+
+BEYOND = 5
+"""Error, in stated deviations, beyond which the stated deviation is too small: no chance explains it."""
+FEWEST_FOR_MEDIANS = 30
+"""Poses needed to draw the medians of tenths."""
+RELIABILITY_BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass
+class Evaluation:
+    """The tables of a scene. Every pair has a row, also if it could not be evaluated (column `state`)."""
+
+    recall: pd.DataFrame
+    """One row per pair: counts, recall, medians over all queries (a missing pose is infinite), `ok_wrong`."""
+    errors: pd.DataFrame
+    """One row per query of a pair: errors, status, inliers, and why it misses each threshold."""
+    retrieval: pd.DataFrame
+    """One row per pair: share of queries with a good reference among the first K, and anywhere in the map."""
+    losses: pd.DataFrame
+    """One row per pair and threshold: queries missed, by reason."""
+    overlap: pd.DataFrame
+    """One row per pair: query images, and the share of them that overlap with their first reference in view."""
+    thresholds: tuple[Threshold, ...] = THRESHOLDS
+    messages: list[str] = field(default_factory=list)
+    """What was not evaluated, and why."""
+    unit: str = "m"
+    """Unit of lengths: m, or `metrics.UNKNOWN_UNIT`."""
+    sequences: pd.DataFrame = field(default_factory=pd.DataFrame)
+    """One row per pair and step of the sequence stage: recall, medians, queries rescued and broken."""
+    changes: pd.DataFrame = field(default_factory=pd.DataFrame)
+    """One row per query that the sequence stage rescued or broke, with its errors before and after."""
+
+    @property
+    def pairs(self) -> pd.DataFrame:
+        """The pairs, with the `reason` why a pair was left out."""
+        state = self.recall["state"].astype(str)
+        left_out = state.str.startswith(LEFT_OUT)
+        reason = state.str.removeprefix(LEFT_OUT).where(left_out, "")
+        return self.recall[["map_device", "query_device"]].assign(reason=reason)
+
+
+@styled
+def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
+    """Return the figures of an evaluation by name, except figures without data."""
+    figures: dict[str, Figure] = {}
+    done = evaluation.recall
+    done = done.dropna(subset=["localized"]) if "localized" in done else done.iloc[:0]
+    if len(done):
+        unit = evaluation.unit
+        small, factor = small_unit(unit)
+        columns = [(f"recall@{threshold_name(t, unit)}", f"recall @ {_limit(t, unit)}", 100.0, "%")
+                   for t in evaluation.thresholds]  # fmt: skip
+        figures["recall"] = draw_matrices(
+            done, columns, "Share of queries localized within the threshold", "higher", (0, 100)
+        )
+        figures["median_errors"] = draw_matrices(
+            done,
+            [("median_rotation_deg", "median rotation error", 1.0, "°"),
+             ("median_translation_m", "median translation error", factor, small)],
+            "Median errors over all queries (∞: half of them have no pose)", "lower",
+        )  # fmt: skip
+        figures["error_curves"] = draw_error_curves(evaluation.errors, evaluation.thresholds, unit)
+        if "p_correct" in evaluation.errors and evaluation.errors["p_correct"].notna().any():
+            figures["reliability"] = draw_reliability(evaluation.errors, unit)
+        if "position_std_m" in evaluation.errors and _has_deviation(evaluation.errors).any():
+            figures["deviations"] = draw_deviations(evaluation.errors, unit)
+        if evaluation.losses["missed"].sum():
+            figures["losses"] = draw_losses(evaluation.losses)
+    if len(evaluation.sequences):
+        figures["sequence"] = draw_steps(evaluation.sequences)
+    retrieval = evaluation.retrieval
+    ks = [c for c in retrieval.columns if c.startswith("recall@")]
+    if ks:
+        evaluated = retrieval.dropna(subset=ks)
+        radius, angle = evaluated["radius_m"].iloc[0], evaluated["angle_deg"].iloc[0]
+        figures["retrieval"] = draw_matrices(
+            evaluated, [(k, f"in the first {k.removeprefix('recall@')}", 100.0, "%") for k in ks]
+            + [("in_map", "anywhere in the map", 100.0, "%")],
+            f"Share of queries with a reference within {radius:g} {evaluation.unit} and {angle:g}°", "higher", (0, 100),
+        )  # fmt: skip
+    return figures
+
+
+def _limit(threshold: Threshold, unit: str) -> str:
+    return f"{threshold[0]:g}°, {threshold[1]:g} {unit}"
+
+
+@styled
+def draw_matrices(
+    table: pd.DataFrame,
+    columns: Sequence[tuple[str, str, float, str]],
+    title: str,
+    better: str,
+    limits: tuple[float, float] | None = None,
+) -> "Figure":
+    """Draw map device x query device matrices side by side.
+
+    Args:
+        table: one row per pair.
+        columns: for each panel the name of a column, its title, factor and unit.
+        better: `higher` or `lower` values are good; chooses the color map.
+        limits: values after the factor at which the colors begin and end; None: 0 and the largest value.
+    """
+    figure = new_figure(3.1 * len(columns) + 0.4, 3.35)
+    maps, queries = (in_order(table[c]) for c in ("map_device", "query_device"))
+    axes = figure.subplots(1, len(columns), squeeze=False)[0]
+    for axis, (column, name, factor, unit) in zip(axes, columns, strict=True):
+        values = np.full((len(maps), len(queries)), np.nan)
+        for row in table.itertuples():
+            i, j = maps.index(row.map_device), queries.index(row.query_device)
+            values[i, j] = factor * float(table.at[row.Index, column])
+        finite = values[np.isfinite(values)]
+        # At least thrice the median: only values that stand out are dark.
+        largest = max(float(finite.max()), 3 * float(np.median(finite)), 1e-9) if len(finite) else 1.0
+        low, high = limits or (0.0, largest)
+        shade = (np.clip(values, low, high) - low) / (high - low)
+        axis.imshow(shade, cmap="Blues" if better == "higher" else "Oranges", vmin=-0.08, vmax=1.25)
+        for (i, j), value in np.ndenumerate(values):
+            text = percent(value / 100) if unit == "%" else number(value)
+            axis.text(j, i, text, ha="center", va="center", fontsize=12,
+                      color="white" if shade[i, j] > 0.6 else "black")  # fmt: skip
+        axis.set_xticks(range(len(queries)), queries)
+        axis.set_yticks(range(len(maps)), maps)
+        axis.set_xlabel("query")
+        axis.set_title(f"{name} [{unit}]", fontsize=10)
+        axis.tick_params(which="both", length=0)
+        axis.set_xticks(np.arange(len(queries) - 1) + 0.5, minor=True)
+        axis.set_yticks(np.arange(len(maps) - 1) + 0.5, minor=True)
+        axis.grid(which="minor", color="white", lw=2)
+        axis.spines[:].set_visible(False)
+    axes[0].set_ylabel("map")
+    figure.suptitle(title)
+    return figure
+
+
+@styled
+def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = THRESHOLDS, unit: str = "m") -> "Figure":
+    """Draw cumulative distributions of the errors: one column per query device, one curve per map device.
+
+    A curve ends at the share of queries that have a pose. Dotted lines are the recall thresholds.
+    """
+    queries, maps = in_order(errors["query_device"]), in_order(errors["map_device"])
+    figure = new_figure(3.6 * len(queries) + 0.8, 6.0)
+    axes = figure.subplots(2, len(queries), squeeze=False, sharey=True, sharex="row")
+    labels = {"translation_error_m": f"translation error [{unit}]", "rotation_error_deg": "rotation error [°]"}
+    for row, (column, label) in enumerate(labels.items()):
+        finite = errors[column].to_numpy(float)
+        finite = np.maximum(finite[np.isfinite(finite)], 1e-4)
+        marks = sorted({threshold[1 - row] for threshold in thresholds})
+        low, high = min([*finite, *marks]), max([*finite, *marks])
+        for axis, query in zip(axes[row], queries, strict=True):
+            for map_ in maps:
+                values = errors.loc[(errors.query_device == query) & (errors.map_device == map_), column]
+                if not len(values):
+                    continue
+                ascending = np.sort(values[np.isfinite(values)].to_numpy(float).clip(1e-4))
+                share = 100 * np.arange(len(ascending) + 1) / len(values)
+                axis.step([low / 2, *ascending, high * 2], [*share, share[-1]], where="post", lw=1.8,
+                          color=color_of(map_), label=f"{map_} map")  # fmt: skip
+            for mark in marks:
+                axis.axvline(mark, color="0.45", lw=0.9, ls=":", label="thresholds" if mark == marks[0] else None)
+            axis.set(xscale="log", xlim=(low / 1.5, high * 1.5), ylim=(0, 102), xlabel=label)
+            plain_log(axis, "x")
+            axis.grid(alpha=0.25)
+            if row == 0:
+                axis.set_title(f"{query} queries", fontsize=10)
+        axes[row, 0].set_ylabel("queries below [%]")
+    axes[0, 0].legend(frameon=False, fontsize=9)
+    figure.suptitle("How many queries have an error below x")
+    return figure
+
+
+@styled
+def draw_reliability(errors: pd.DataFrame, unit: str = "m") -> "Figure":
+    """Draw the share of right poses (within `WRONG`) against the probability that the localizer states.
+
+    Bars are 95 % intervals (Wilson, 1927); numbers count the poses.
+    """
+    errors = errors[errors["p_correct"].notna()]
+    right = is_below(errors["rotation_error_deg"].to_numpy(), errors["translation_error_m"].to_numpy(), WRONG)
+    stated = errors["p_correct"].to_numpy(float)
+    bin_of = np.digitize(stated, RELIABILITY_BINS[1:-1])
+    figure = new_figure(5.2, 4.6)
+    axis = figure.subplots()
+    axis.plot([0, 100], [0, 100], color="0.6", lw=1, ls=":", label="as stated")
+    for k in np.unique(bin_of):
+        in_bin = bin_of == k
+        count, share = int(in_bin.sum()), float(right[in_bin].mean())
+        low, high = wilson_interval(share, count)
+        x = 100 * stated[in_bin].mean()
+        axis.errorbar(
+            x, 100 * share, [[100 * max(share - low, 0)], [100 * max(high - share, 0)]], fmt="o", color=SKY, capsize=3
+        )
+        offset, side = ((-6, -10), "right") if x > 90 else ((6, -10), "left")
+        axis.annotate(
+            str(count), (x, 100 * share), offset, textcoords="offset points", ha=side, fontsize=8, color="0.3"
+        )
+    axis.set(xlim=(-3, 103), ylim=(-3, 103))
+    axis.set(xlabel="stated probability of being right [%]", ylabel="poses that are right [%]")
+    axis.legend(frameon=False, fontsize=8, loc="upper left")
+    axis.grid(alpha=0.25)
+    figure.suptitle(f"Stated and actual probability of being right (right: {_limit(WRONG, unit)})")
+    return figure
+
+
+@styled
+def draw_deviations(errors: pd.DataFrame, unit: str = "m") -> "Figure":
+    """Draw the position errors against the standard deviations that the localizer states.
+
+    With enough poses, a line joins the medians of tenths of the poses. If the stated deviations are right and errors
+    are Gaussian, the medians lie a little below the stated deviation, and hardly any pose is above the upper line.
+    """
+    errors = errors[_has_deviation(errors)]
+    stated, actual = (errors[name].to_numpy(float).clip(1e-5) for name in ("position_std_m", "translation_error_m"))
+    ok = (errors["status"] == "ok").to_numpy(bool)
+    figure = new_figure(5.2, 4.6)
+    axis = figure.subplots()
+    low, high = min(stated.min(), actual.min()) / 1.5, max(stated.max(), actual.max()) * 1.5
+    axis.plot([low, high], [low, high], color="0.6", lw=1, ls=":", label="error = stated deviation")
+    axis.plot([low, high], [BEYOND * low, BEYOND * high], color="0.6", lw=1, ls="--", label=f"{BEYOND} times that")
+    for chosen, name, color in ((ok, "ok", SKY), (~ok, "low confidence", ORANGE)):
+        if chosen.any():
+            beyond = float(np.mean(actual[chosen] > BEYOND * stated[chosen]))
+            label = f"{name}: {chosen.sum()}, {percent(beyond)} % above"
+            axis.plot(stated[chosen], actual[chosen], "o", ms=3.5, alpha=0.5, mew=0, color=color, label=label)
+    if len(stated) >= FEWEST_FOR_MEDIANS:
+        tenths = np.array_split(np.argsort(stated), 10)
+        medians = np.array([(np.median(stated[tenth]), np.median(actual[tenth])) for tenth in tenths])
+        axis.plot(*medians.T, color="0.15", lw=1.5, marker="o", ms=3, label="medians of tenths of the poses")
+    axis.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high))
+    plain_log(axis, "xy")
+    axis.set(xlabel=f"stated standard deviation of the position [{unit}]", ylabel=f"position error [{unit}]")
+    axis.grid(alpha=0.25)
+    axis.legend(frameon=False, fontsize=8, loc="upper left")
+    figure.suptitle("Stated and actual deviation of the position")
+    return figure
+
+
+def _has_deviation(errors: pd.DataFrame) -> pd.Series:
+    """Return which rows have an error and a stated deviation; the latter is infinite if the scale is unknown."""
+    return errors["position_std_m"].between(0, np.inf, "neither") & np.isfinite(errors["translation_error_m"])
+
+
+def wilson_interval(share: float, count: int, z: float = 1.96) -> tuple[float, float]:
+    """Return the Wilson interval (1927) of a share observed in `count` trials; `z`: half width, standard deviations."""
+    middle = share + z**2 / (2 * count)
+    half = z * np.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
+    return float((middle - half) / (1 + z**2 / count)), float((middle + half) / (1 + z**2 / count))
+
+
+@styled
+def draw_losses(losses: pd.DataFrame) -> "Figure":
+    """Draw the share of missed queries of each pair by reason, one panel per threshold."""
+    losses = losses.dropna(subset=["threshold"])
+    thresholds = list(dict.fromkeys(losses["threshold"]))
+    pairs = list(dict.fromkeys(zip(losses["map_device"], losses["query_device"], strict=True)))
+    widest = max(10.0, 115 * float((losses["missed"] / losses["queries"]).max()))
+    figure = new_figure(3.3 * len(thresholds) + 1.2, 0.3 * len(pairs) + 1.7)
+    axes = figure.subplots(1, len(thresholds), squeeze=False, sharey=True, sharex=True)[0]
+    for axis, threshold in zip(axes, thresholds, strict=True):
+        rows = losses[losses["threshold"] == threshold].set_index(["map_device", "query_device"]).loc[pairs]
+        left = np.zeros(len(rows))
+        for reason, color in zip(REASONS, (SKY, ORANGE, VERMILLION), strict=True):
+            share = 100 * (rows[reason] / rows["queries"]).to_numpy(float)
+            axis.barh(range(len(rows)), share, left=left, color=color, label=reason, height=0.72)
+            left += share
+        for y, value in enumerate(left):
+            axis.text(value + 0.012 * widest, y, f"{value:.0f}", va="center", fontsize=8, color="0.3")
+        axis.set(xlim=(0, widest), xlabel="queries [%]")
+        axis.set_title(f"missed @ {_limit(parse_threshold(threshold), unit_of(threshold))}", fontsize=10)
+        axis.grid(axis="x", alpha=0.25)
+    axes[0].set_yticks(range(len(pairs)), [f"{q} in {m} map" for m, q in pairs])
+    axes[0].invert_yaxis()
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    figure.suptitle("Where accuracy was lost")
+    return figure

@@ -1,0 +1,264 @@
+"""Tables and figures for the notebooks: the content of a capture, and the results of the stages."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+
+from toolkit.capture import Capture, Session, Trajectory
+from toolkit.capture.devices import color_of
+from toolkit.capture.tables import POSE_NAMES, read_query_table
+from toolkit.embedders import embedding_folders, open_descriptors
+from toolkit.errors import CaptureError
+from toolkit.figures.query_images import draw_image
+from toolkit.figures.style import GREEN, ORANGE, VERMILLION, new_figure, plain_log, shared_legend, styled
+from toolkit.figures.top_view import Ground, Layer, draw_places
+from toolkit.files import image_name, pair_devices, read_references
+from toolkit.geometry import Floats, qt_from_pose, unit
+from toolkit.results.metrics import is_posed
+from toolkit.sequences.odometry import Odometry, recordings_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def describe(capture: Capture, queries: str = "keyframes_pruned_subsampled") -> pd.DataFrame:
+    """Return one row per session: counts of images, posed images, rigs, subsessions and queries.
+
+    `odometry` tells the number of odometry poses, their duration, and the number of pieces between losses of tracking
+    (by the defaults of the stage `sequence`); `radio` lists the kinds of scans. `reason` tells why later stages cannot
+    use a session.
+    """
+    rows = []
+    for name in capture:
+        device, _, split = name.rpartition("_")
+        row: dict[str, Any] = {"session": name, "device": device, "split": split}
+        row |= dict.fromkeys(("images", "subsessions", "cameras", "rigs", "with pose", "queries"), 0)
+        row |= dict.fromkeys(("odometry", "radio", "reason"), "")
+        rows.append(row)
+        try:
+            session = capture[name]
+            row |= {
+                "images": len(session.images), "subsessions": len(session.subsessions),
+                "cameras": int(session.sensors["sensor_type"].eq("camera").sum()),
+                "rigs": 0 if session.rigs is None else session.rigs["rig_id"].nunique(),
+                "with pose": len(_poses(session)), "odometry": _odometry(session),
+                "radio": ", ".join(kind for kind in ("wifi", "bt") if (session.path / f"{kind}.txt").exists()),
+            }  # fmt: skip
+            if split == "query":
+                row["queries"] = len(session.keyframes(queries))
+            elif not row["with pose"]:
+                row["reason"] = "a map without poses"
+        except CaptureError as error:
+            row["reason"] = str(error)
+    return pd.DataFrame(rows).set_index("session")
+
+
+def _odometry(session: Session) -> str:
+    if session.odometry is None:
+        return ""
+    times, poses = session.odometry.timestamps, session.odometry.world_from_device
+    pieces, seconds = 0, 0.0
+    for rows in recordings_of(session, session.odometry).values():
+        pieces += len(Odometry(times[rows], poses[rows]).split())
+        seconds += np.ptp(times[rows]) / 1e6
+    return f"{len(times):,} poses, {seconds:,.0f} s, {pieces:,} piece{'s' if pieces > 1 else ''}"
+
+
+def list_poses(path: str | Path) -> pd.DataFrame:
+    """Return image, status and world_from_device of the queries of a pair, as in its files; NaN without a pose.
+
+    Args:
+        path: the pair's `.csv`.
+    """
+    table = read_query_table(Path(path), ["status"])
+    poses = Trajectory.read(Path(path).with_suffix(".txt")).lookup(table["timestamp"].to_numpy(), table["device_id"])
+    rows = np.full((len(table), len(POSE_NAMES)), np.nan)
+    rows[is_posed(poses)] = qt_from_pose(poses[is_posed(poses)])
+    return table.reindex(columns=["image", "status"]).join(pd.DataFrame(rows, columns=POSE_NAMES))
+
+
+@styled
+def draw_samples(capture: Capture, count: int = 4) -> "Figure":
+    """Draw `count` images of each session, evenly spread over the recording; return the figure."""
+    names = [session.id for session in _usable(capture) if len(session)]
+    if not names:
+        return _empty("no session with images can be used")
+    figure = new_figure(2.4 * count, 1.9 * len(names))
+    axes = figure.subplots(len(names), count, squeeze=False)
+    for line, name in zip(axes, names, strict=True):
+        session = capture[name]
+        for axis, row in zip(line, np.linspace(0, len(session) - 1, count).round().astype(int), strict=True):
+            draw_image(axis, session.image_path(row), 2.4)
+        line[0].set_ylabel(name)
+    return figure
+
+
+@styled
+def draw_top_view(capture: Capture, up: ArrayLike | None = None, unit: str | None = "auto") -> "Figure":
+    """Draw all camera centers from above, those of queries only with ground truth; return the figure.
+
+    Args:
+        capture: the capture; places far apart get panels of their own.
+        up: up direction (3,); None: estimated from the cameras.
+        unit: unit of the poses, None if unknown; `auto`: that of the capture.
+    """
+    unit = capture.unit if unit == "auto" else unit
+    poses = {session.id: of_session for session in _usable(capture) if len(of_session := _poses(session))}
+    if not poses:
+        return _empty("no session with poses can be used")
+    everything = np.concatenate(list(poses.values()))
+    layers = []
+    for name, of_session in poses.items():
+        style = {"s": 14} if capture[name].split == "map" else {"s": 36, "marker": "x"}
+        layers.append(Layer(of_session, name, color_of(capture[name].device), alpha=0.8, **style))
+    figure, _, panels = draw_places(Ground.below(everything, up, (unit, 1.0)), layers, everything)
+    shared_legend(figure, [axis for axis, _, _ in panels], ncols=6, frameon=False, fontsize=8)
+    figure.suptitle("Cameras from above: maps (dots), queries where their pose is known (crosses)")
+    return figure
+
+
+@styled
+def draw_similarity(embeddings: str | Path, limit: int = 300) -> "Figure":
+    """Draw the cosine similarity of a query session's images to another device's map; return the figure.
+
+    With several descriptors, the similarities are fused as for retrieval.
+
+    Args:
+        embeddings: folder of the descriptors, `<device>_<split>/<subsession>/<subsession>.npy`.
+        limit: largest number of images per session, evenly spread.
+    """
+    from toolkit.embedders.search import fuse  # loads FAISS
+
+    first = next(iter(embedding_folders(embeddings).values()))
+    sessions = [folder.name for folder in sorted(first.iterdir()) if folder.is_dir()]
+    query = next((name for name in sessions if name.endswith("_query")), next(iter(sessions)))
+    maps = [name for name in sessions if name.endswith("_map")] or list(sessions)
+    device = query.rpartition("_")[0]
+    map_ = next((name for name in maps if name.rpartition("_")[0] != device), maps[0])
+    figure = new_figure(8, 4.5)
+    plot = figure.subplots()
+    rows, columns = (_descriptors(Path(embeddings), session, limit) for session in (query, map_))
+    products = [row @ column.T for row, column in zip(rows, columns, strict=True)]
+    values = products[0] if len(products) == 1 else fuse(products)
+    image = plot.imshow(values, aspect="auto", interpolation="nearest", cmap="viridis")
+    plot.set(xlabel=f"images of {map_}", ylabel=f"images of {query}")
+    figure.colorbar(image, label="cosine similarity" if len(products) == 1 else "fused similarity")
+    return figure
+
+
+@styled
+def draw_references(sessions_root: str | Path, jsonl: str | Path, samples: int = 4, references: int = 4) -> "Figure":
+    """Draw some query images of a pair, each beside its first references; return the figure.
+
+    Args:
+        jsonl: the retrieval of a pair, `<scene>_map_<M>_query_<Q>.jsonl`.
+    """
+    lines = read_references(jsonl)
+    chosen = np.unique(np.linspace(0, len(lines) - 1, min(samples, len(lines))).round().astype(int))
+    return _draw_rows(sessions_root, jsonl, [[lines[row]] for row in chosen], references)
+
+
+@styled
+def draw_reranked(
+    sessions_root: str | Path, jsonl: str | Path, retrieved: str | Path, samples: int = 4, references: int = 3
+) -> "Figure":
+    """Draw query images, each with its first references before and (to the right) after reranking; return the figure.
+
+    The queries drawn are those whose new first reference had the worst retrieval rank.
+
+    Args:
+        jsonl: the reranked references of a pair, `<scene>_map_<M>_query_<Q>.jsonl`.
+        retrieved: the references of the retrieval stage.
+        references: number of references shown per query, before and after.
+    """
+    before, after = read_references(retrieved), read_references(jsonl)
+    moved = [-row["topk"][0]["retrieval_rank"] if row["topk"] else 0 for row in after]
+    chosen = np.argsort(moved, kind="stable")[:samples]
+    return _draw_rows(sessions_root, jsonl, [[before[row], after[row]] for row in chosen], references)
+
+
+def _draw_rows(
+    sessions_root: str | Path, jsonl: str | Path, rows: list[list[dict[str, Any]]], references: int
+) -> "Figure":
+    """Draw one row per query: its image, then its first references in each entry of `rows`."""
+    capture = Capture.from_sessions_root(sessions_root)
+    map_device, query_device = pair_devices(Path(jsonl).stem)
+    if not rows:
+        return _empty(f"no queries of {query_device}")
+    width = 1 + references * max(len(row) for row in rows)
+    figure = new_figure(2.2 * width, 1.9 * len(rows))
+    axes = figure.subplots(len(rows), width, squeeze=False)
+    for line, row in zip(axes, rows, strict=True):
+        for axis in line[1:]:
+            axis.set_axis_off()  # a query may have fewer references
+        shown = [(line[0], row[0], f"query {query_device}")]
+        for block, query in enumerate(row):
+            for axis, hit in zip(line[1 + block * references :], query["topk"][:references], strict=False):
+                verified = "retrieval_rank" in hit
+                score = f"{hit['score']} verified, was {hit['retrieval_rank']}" if verified else f"{hit['score']:.2f}"
+                shown.append((axis, hit, f"{map_device} {score}"))
+        for axis, entry, title in shown:
+            draw_image(axis, capture.image_path(image_name(entry["path"])), 2.2, title)
+    return figure
+
+
+@styled
+def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
+    """Draw the number of inliers of each query, by pair and status; return the figure.
+
+    Args:
+        paths: poses of each pair, `<scene>_map_<M>_query_<Q>.txt` or `.csv`.
+    """
+    tables = {pair_devices(Path(path).stem): pd.read_csv(Path(path).with_suffix(".csv")) for path in paths}
+    figure = new_figure(8, 0.35 * len(tables) + 1.2)
+    plot = figure.subplots()
+    colors = {"ok": GREEN, "low_confidence": ORANGE, "failed": VERMILLION}
+    for status, color in colors.items():
+        rows = [table[table["status"].str.startswith(status)] for table in tables.values()]
+        inliers = np.concatenate([row["num_inliers"].fillna(0).to_numpy(float) for row in rows])
+        heights = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
+        label = f"{status.replace('_', ' ')}: {len(inliers)}"
+        plot.scatter(np.maximum(inliers, 0.5), heights, s=24, c=color, alpha=0.6, label=label, clip_on=False)
+    plot.set_yticks(range(len(tables)), [f"{queried} in {mapped} map" for mapped, queried in tables])
+    plot.invert_yaxis()
+    plot.set_xscale("log")
+    least, most = plot.get_xlim()
+    if least < 0.5:  # there are queries without inliers: failed ones, or those of a method without matches
+        plot.set_xlim(0.5, max(most, 10.0))
+    plain_log(plot, "x")
+    plot.set_xlabel("inliers of a query (log scale; none at the left edge)")
+    figure.legend(fontsize=8, loc="outside lower center", ncols=3)
+    return figure
+
+
+def _descriptors(embeddings: Path, session: str, limit: int) -> list[NDArray[np.float32]]:
+    """Return each kind of unit descriptors of a session, (N <= limit, D)."""
+    if len(embedding_folders(embeddings)) > 1:
+        vectors, _ = open_descriptors(embeddings, session, normalize=True)
+        chosen = vectors[:: max(1, -(-len(vectors) // limit))]
+        return np.split(chosen, np.cumsum(vectors.dims)[:-1], axis=1)
+    parts = [np.load(file, mmap_mode="r") for file in sorted((embeddings / session).rglob("*.npy"))]
+    total = sum(len(part) for part in parts)
+    step = max(1, -(-total // limit))
+    rows = np.concatenate([np.asarray(part[::step], np.float32) for part in parts])
+    return [unit(rows)]
+
+
+def _empty(why: str) -> "Figure":
+    figure = new_figure(4, 1)
+    figure.text(0.5, 0.5, why, ha="center", va="center")
+    return figure
+
+
+def _usable(capture: Capture) -> list[Session]:
+    return sorted([*capture.usable("map"), *capture.usable("query")], key=lambda session: session.id)
+
+
+def _poses(session: Session) -> Floats:
+    """Return world_from_cam (n, 4, 4) of the images with a pose; of queries the true one."""
+    poses = session.world_from_cam(ground_truth=session.split == "query")
+    return poses[is_posed(poses)]

@@ -1,0 +1,292 @@
+"""Inspect one query of a finished run: the stored results of the localize stage in words, numbers and pictures.
+
+Nothing here localizes, except `Inspection.again`.
+"""
+
+import json
+import textwrap
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from toolkit.capture import Capture, Trajectory
+from toolkit.errors import OF_THE_DATA, ArtifactError
+from toolkit.figures.answers import LABELS, Answer
+from toolkit.figures.choice import find_query, shown_name
+from toolkit.figures.inspection_view import draw_answers
+from toolkit.figures.style import shown
+from toolkit.files import SceneFiles, image_name, pair_devices, read_references, require_current
+from toolkit.geometry import Floats
+from toolkit.manifest import LocalizeSettings, nearest
+from toolkit.pose.correspondences import LocalizedQuery
+from toolkit.results.metrics import is_posed, worst_first
+from toolkit.results.pair import LocalizedPair
+from toolkit.scene.map import RETRIEVAL, SESSIONS_ROOT, Map, how_localized, label
+from toolkit.scene.relocalize import LocalizeAgain
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+WORST = "worst"
+"""Alias for the number of the worst query."""
+
+
+@dataclass(frozen=True, repr=False)
+class Inspection(Answer):
+    """One query of a pair, as it was localized. A notebook displays its figure."""
+
+    of: "InspectedPair" = field(kw_only=True)
+    """The pair that it belongs to."""
+
+    def again(self, changes: Mapping[str, Any] | None = None) -> "Comparison":
+        """Localize the query again, from the stored features and references, with some settings changed.
+
+        Args:
+            changes: settings that differ from those of the run, such as `{"pnp": {"min_inliers": 30}}`.
+
+        Returns:
+            This answer and the new one. Nothing is written.
+
+        Raises:
+            ManifestError: a setting does not exist, or the features or the map depend on it.
+            ToolkitError: features, the map or weights of the run are missing.
+        """
+        return Comparison(self, self.of.localize(self.number, changes or {}), dict(changes or {}))
+
+    @cached_property
+    def figure(self) -> "Figure":
+        title = f"{self.headline}\n{shown_name(self.name, 110)}\n{textwrap.fill(self.reason, 130)}"
+        return draw_answers([self], title)
+
+    def _repr_mimebundle_(self, **_: Any) -> dict[str, bytes]:
+        return shown(self.figure)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One query localized twice. A notebook displays its figure."""
+
+    before: Inspection
+    after: Inspection
+    changes: dict[str, Any]
+    """Settings that were changed."""
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """Status, method, numbers, errors and seconds as texts; columns before and after."""
+        both = {"before": self.before, "after": self.after}
+        return pd.DataFrame({name: {"status": one.status, **one.texts} for name, one in both.items()}, dtype=object)
+
+    @cached_property
+    def figure(self) -> "Figure":
+        """Both answers side by side."""
+        changed = json.dumps(self.changes)[1:-1] if self.changes else "no setting changed"
+        first = self.before.headline.rpartition(":")[0]
+        return draw_answers([self.before, self.after], f"{first}, localized again\n{textwrap.fill(changed, 120)}")
+
+    def __repr__(self) -> str:
+        return f"{self.changes or 'nothing changed'}\nbefore: {self.before!r}\nafter: {self.after!r}"
+
+    def _repr_mimebundle_(self, **_: Any) -> dict[str, bytes]:
+        return shown(self.figure)
+
+
+class InspectedPair:
+    """The queries of one pair of a finished run, to inspect one at a time."""
+
+    def __init__(
+        self,
+        map_device: str,
+        query_device: str,
+        poses_dir: str | Path,
+        features_dir: str | Path | None = None,
+        map_dir: str | Path | None = None,
+        sessions_root: str | Path | None = None,
+    ) -> None:
+        """
+        Args:
+            map_device, query_device: the pair.
+            poses_dir, features_dir, map_dir: folders of the localize stage; None: the folders of the run that
+                `poses_dir` belongs to.
+            sessions_root: `<capture>/sessions`; None: its path when the pair was localized.
+
+        Raises:
+            ArtifactError: the pair does not exist, or its files are missing or torn.
+        """
+        pairs = sorted(Path(poses_dir).glob("*_map_*_query_*.h5"))
+        names = [pair_devices(path.stem) for path in pairs]
+        if (map_device, query_device) not in names:
+            known = [f"{query} in {map_}" for map_, query in names]
+            raise ArtifactError(
+                f"{poses_dir}: no correspondences of queries of {query_device!r} in the map of {map_device!r}, "
+                f"`<pair>.h5`. {nearest(f'{query_device} in {map_device}', known)} Localize first: "
+                "python -m toolkit run MANIFEST."
+            )
+        self.map_device, self.query_device = map_device, query_device
+        self._h5 = pairs[names.index((map_device, query_device))]
+        files = SceneFiles(self._h5.parents[2], self._h5.parents[1].name)
+        self._features_dir, self._map_dir = Path(features_dir or files.features), Path(map_dir or files.maps)
+        self.settings, paths, _ = how_localized(self._h5)
+        self.retrieval = Path(paths[RETRIEVAL]) / f"{self._h5.stem}.jsonl"
+        capture = Capture.from_sessions_root(sessions_root or paths[SESSIONS_ROOT])
+        self.localized = LocalizedPair.open(capture, map_device, query_device, poses_dir, self._map_dir)
+        self.names = self.localized.localizations.names
+        """Name of the first image of each query."""
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def label(self) -> str:
+        return f"{self.query_device} in the map of {self.map_device}"
+
+    def look(self, query: int | str = 0) -> Inspection:
+        """Return a query with the stored results of the localize stage.
+
+        Args:
+            query: its number, the name of one of its images (or a unique end of the name), or `worst`.
+
+        Raises:
+            ArtifactError: no query matches, or several do (the nearest is named), or its stored results are damaged.
+        """
+        if query == WORST and len(self):
+            query = int(self.localized.localizations.worst_first()[0])
+        names = self.localized.query_session.image_names
+        images = {names[row]: number for number, rows in enumerate(self.localized.rows) for row in rows}
+        number = find_query(query, images, len(self))
+        row = self.localized.table.iloc[number]
+        found = {name: value for name, value in row.items() if pd.notna(value)}
+        found["covariance"] = self._covariances.get((int(row["timestamp"]), str(row["device_id"])))
+        return self._inspection(
+            number, found, self.localized.world_from_rig[number], self.localized.localized(number), self.settings
+        )
+
+    def localize(self, number: int, changes: Mapping[str, Any]) -> Inspection:
+        """Localize a query again; see `Inspection.again`."""
+        settings = self._again.settings(changes)
+        estimate, localized, seconds = self._again.localize(self.localized.rows[number], settings)
+        found = {name: getattr(estimate, name) for name in (*LABELS, "status", "reason", "covariance")}
+        found["method"] = label(settings, "" if estimate.world_from_rig is None else estimate.found_by)
+        return self._inspection(number, found | {"seconds": seconds}, estimate.world_from_rig, localized, settings)
+
+    def _inspection(
+        self, number: int, found: Mapping[str, Any], pose: Floats | None, localized: LocalizedQuery,
+        settings: LocalizeSettings,
+    ) -> Inspection:  # fmt: skip
+        """Return a result; `found`: its status, reason, method, covariance, seconds and numbers, as far as known."""
+        numbers = {name: float(found[name]) for name in LABELS if name in found and np.isfinite(found[name])}
+        if "position_std_m" in numbers:
+            numbers["position_std_m"] /= self.localized.unit[1]
+        covariance, (stated, method) = found["covariance"], (str(found.get(name, "")) for name in ("reason", "method"))
+        return Inspection(
+            self.localized, number, str(found["status"]), stated, method, numbers,
+            localized, pose if pose is not None and is_posed(pose) else None,
+            covariance if covariance is not None and np.isfinite(covariance).all() else None,
+            settings, float(found.get("seconds", np.nan)), self._retrieved(number), of=self,
+        )  # fmt: skip
+
+    @cached_property
+    def _again(self) -> LocalizeAgain:
+        """Cached: opening the map takes time."""
+        require_current(self._h5.with_suffix(".txt"), "localize", missing=False)
+        map_ = Map.of_pair(self._h5, self.map_device, self._features_dir, self._map_dir)
+        return LocalizeAgain(map_, self.localized.query_session, self.retrieval)
+
+    @cached_property
+    def _covariances(self) -> dict[tuple[int, str], Floats]:
+        poses = Trajectory.read(self._h5.with_suffix(".txt"))
+        keys = zip(poses.timestamps.tolist(), map(str, poses.device_ids), strict=True)
+        return {} if poses.covariances is None else dict(zip(keys, poses.covariances, strict=True))
+
+    @cached_property
+    def _topk(self) -> dict[tuple[int, str], list[dict[str, Any]]]:
+        with suppress(ArtifactError):  # poses can be inspected without the retrieval that they were made from
+            require_current(self._h5.with_suffix(".txt"), "localize", (".jsonl",))
+            rows = read_references(self.retrieval)
+            return {(int(row["timestamp"]), str(row["sensor_id"])): row["topk"] for row in rows}
+        return {}
+
+    def _retrieved(self, number: int) -> dict[str, tuple[int, float]]:
+        images = self.localized.query_session.images.iloc[self.localized.rows[number]]
+        best: dict[str, tuple[int, float]] = {}
+        for key in zip(images["timestamp"].tolist(), images["sensor_id"].astype(str).tolist(), strict=True):
+            for rank, hit in enumerate(self._topk.get(key, []), start=1):
+                name = image_name(hit["path"])
+                ranked = rank, float(hit.get("score", np.nan))
+                best[name] = min(best.get(name, ranked), ranked, key=lambda one: (one[0], -one[1]))
+        return dict(sorted(best.items(), key=lambda item: item[1][0]))
+
+
+class WorstQueries:
+    """The queries of several pairs, the worst first, to inspect one at a time."""
+
+    def __init__(
+        self,
+        poses_dir: str | Path,
+        map_dir: str | Path | None = None,
+        sessions_root: str | Path | None = None,
+        map_device: str = "all",
+        query_device: str = "all",
+    ) -> None:
+        """Take the queries of all pairs in a folder of poses that have stored correspondences and can be read.
+
+        Args:
+            poses_dir, map_dir, sessions_root: as for `InspectedPair`.
+            map_device, query_device: devices of the pairs, or `all`.
+        """
+        pairs: list[InspectedPair] = []
+        for path in sorted(Path(poses_dir).glob("*_map_*_query_*.h5")):
+            mapped, queried = pair_devices(path.stem)
+            if map_device in ("all", mapped) and query_device in ("all", queried):
+                with suppress(*OF_THE_DATA):  # an unfinished pair has no table, or a session broke after a good run
+                    pairs.append(InspectedPair(mapped, queried, poses_dir, None, map_dir, sessions_root))
+        queries = [(pair, number) for pair in pairs for number in range(len(pair))]
+        tables = [pair.localized.localizations.ranked for pair in pairs]
+        order = worst_first(pd.concat(tables, ignore_index=True)).tolist() if queries else []
+        self._queries = [queries[k] for k in order]
+        self.names = [f"{pair.label}: {shown_name(pair.names[number])}" for pair, number in self._queries]
+
+    def look(self, rank: int | str = 0) -> Inspection:
+        """Return a query by its rank, 0 for the worst of all.
+
+        Raises:
+            ArtifactError: the rank is out of range.
+        """
+        if not isinstance(rank, int | np.integer) or not 0 <= rank < len(self.names):
+            raise ArtifactError(f"query: found {rank!r}, expected a rank from 0, the worst, to {len(self.names) - 1}.")
+        pair, number = self._queries[int(rank)]
+        return pair.look(number)
+
+
+def inspect_query(
+    run: str | Path,
+    scene: str,
+    map: str,  # noqa: A002
+    query: str,
+    n: int | str = 0,
+) -> Inspection:
+    """Return one query of a finished run with the stored results of the localize stage.
+
+    Args:
+        run: the run folder, `<output_root>/<manifest name>`.
+        scene: the capture's name.
+        map, query: devices of the pair, such as `ios` and `hl`.
+        n: number of the query, name of one of its images (or a unique end of it), or `worst`.
+
+    Raises:
+        ArtifactError: the run, pair or query does not exist (the nearest is named), or files are missing or torn.
+    """
+    files = SceneFiles(Path(run), scene)
+    if not files.poses_dir.is_dir():
+        runs = [path.parent.parent.name for path in Path(run).glob("*/poses/settings.json")]
+        raise ArtifactError(
+            f"{files.poses_dir}: no poses of the scene {scene!r} in the run {run}. {nearest(scene, runs)} "
+            "Localize first: python -m toolkit run MANIFEST."
+        )
+    return InspectedPair(map, query, files.poses_dir, files.features, files.maps).look(n)

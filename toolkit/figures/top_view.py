@@ -1,0 +1,205 @@
+"""Draw a map from above: layers of dots, cameras and tracks on the ground plane, one panel per place."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from toolkit.capture.world_up import up_of_cameras
+from toolkit.figures.style import new_figure
+from toolkit.geometry import Floats, Ints
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MAX_PLACES = 6
+"""Panels of a figure, at most: the places with the most cameras."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The ground plane that a map is drawn on."""
+
+    axes: Floats
+    """(2, 3) right and upward axis of the picture, world."""
+    labels: list[str]
+    length: float
+    """Unit of lengths in the picture, in the unit of the poses."""
+
+    @classmethod
+    def below(cls, poses: Floats, up: ArrayLike | None = None, unit: tuple[str | None, float] = ("m", 1.0)) -> "Ground":
+        """Return the ground below cameras (N, 4, 4); `up`: up direction (3,), None: estimated from the cameras."""
+        return cls(*ground_axes(up_of_cameras(poses) if up is None else up, unit[0]), unit[1])
+
+    def flat(self, world: Floats) -> Floats:
+        """Return positions (..., 2) in the picture of world positions (..., 3) or poses (..., 4, 4)."""
+        positions = world[..., :3, 3] if world.shape[-1] == 4 else world
+        return np.asarray(positions @ self.axes.T / self.length)
+
+
+class Layer:
+    """Positions, cameras, or a track, that are drawn in one style."""
+
+    def __init__(
+        self, at: Floats, label: str | None = None, color: Any = "0.6", heading: float = 0.0, track: bool = False,
+        hollow: bool = False, **style: Any,
+    ) -> None:  # fmt: skip
+        """
+        Args:
+            at: positions (N, 3) or poses of cameras (N, 4, 4), world; NaN is not drawn.
+            label: text in the legend.
+            color: one color, or an array of one per item.
+            heading: length of the line in a camera's viewing direction, as a share of the panel.
+            track: whether the positions are joined.
+            style: passed to matplotlib's `scatter`, of a track to `plot`.
+        """
+        self.at, self.label, self.color, self.heading = at, label, color, heading
+        self.track, self.hollow, self.style = track, hollow, style
+
+
+def draw_layers(axis: "Axes", ground: Ground, layers: Sequence[Layer], window: Floats) -> None:
+    """Draw what lies in a window, low and high corner (2, 2); labels are only of what is drawn."""
+    from matplotlib.collections import LineCollection
+
+    for layer in layers:
+        xy = ground.flat(layer.at)
+        inside = ((xy >= window[0]) & (xy <= window[1])).all(axis=1)
+        if not inside.any():
+            continue
+        if layer.track:
+            axis.plot(*xy.T, color=layer.color, label=layer.label, **layer.style)
+            continue
+        color = layer.color[inside] if isinstance(layer.color, np.ndarray) else layer.color
+        if layer.heading:
+            length = layer.heading * np.ptp(window, axis=0).max()
+            lines = np.stack([xy, xy + length * layer.at[:, :3, 2] @ ground.axes.T], axis=1)[inside]
+            zorder = layer.style.get("zorder", 2)
+            axis.add_collection(LineCollection(list(lines), colors=color, linewidths=1.1, alpha=0.8, zorder=zorder))
+        face: dict[str, Any] = {"facecolors": "none", "edgecolors": color} if layer.hollow else {"c": color}
+        x, y = xy[inside].T
+        axis.scatter(x, y, label=layer.label, **face, **layer.style)
+    axis.set(xlim=window[:, 0], ylim=window[:, 1], aspect="equal", xlabel=ground.labels[0], ylabel=ground.labels[1])
+
+
+class Places:
+    """Places of a map that lie apart, and their windows."""
+
+    def __init__(self, cameras: Floats) -> None:
+        """Cluster positions of cameras (N, 2)."""
+        self.cameras, self.numbers = cameras, places_of(cameras)
+
+    def nearest(self, xy: Floats) -> Ints:
+        """Return the place of the camera nearest to each position (N, 2); -1 for an unknown position."""
+        from scipy.spatial import cKDTree
+
+        nearest = np.full(len(xy), -1, np.int64)
+        finite = np.isfinite(xy).all(1)
+        if finite.any() and len(self.cameras):
+            nearest[finite] = self.numbers[cKDTree(self.cameras).query(xy[finite])[1]]
+        return nearest
+
+    def contents(self, place: int, cloud: Floats, others: Floats) -> Floats:
+        """Return the positions that a picture of a place should contain: its cameras, those of `others` that are
+        nearest to it, and the corners of its part of the cloud without the few points far away."""
+        cloud = cloud[self.nearest(cloud) == place]
+        corners = np.percentile(cloud, [3, 97], axis=0) if len(cloud) else cloud
+        return np.concatenate([self.cameras[self.numbers == place], corners, others[self.nearest(others) == place]])
+
+
+def window_of(xy: Floats, margin: float = 0.07, longest: float = 1.0) -> Floats:
+    """Return a window, low and high corner (2, 2), around positions (N, 2).
+
+    Args:
+        margin: share of their extent that is added on each side.
+        longest: limit of the ratio of its sides; 1: a square.
+    """
+    xy = xy if len(xy) else np.zeros((1, 2))
+    half = (0.5 + margin) * np.ptp(xy, axis=0)
+    half = np.maximum(half, max(half.max(), 0.5) / longest)
+    middle = (xy.min(axis=0) + xy.max(axis=0)) / 2
+    return np.stack([middle - half, middle + half])
+
+
+def draw_places(
+    ground: Ground, layers: Sequence[Layer], cameras: Floats, cloud: Floats | None = None, others: Floats | None = None
+) -> tuple["Figure", Places, list[tuple["Axes", int, Floats]]]:
+    """Draw layers, one panel per place.
+
+    Args:
+        cameras: (N, 3) or (N, 4, 4), which make the places.
+        cloud, others: see `Places.contents`, (N, 3) or (N, 4, 4).
+
+    Returns:
+        The figure, the places, and each panel with the number and the window of its place.
+    """
+    none = np.zeros((0, 3))
+    places = Places(ground.flat(cameras))
+    counts = np.bincount(places.numbers, minlength=1)
+    shown = np.sort(np.argsort(-counts, kind="stable")[:MAX_PLACES])
+    flat = [ground.flat(none if each is None else each) for each in (cloud, others)]
+    windows = [window_of(places.contents(place, *flat), longest=2.2) for place in shown]
+    columns = min(len(shown), 3)
+    rows = -(-len(shown) // columns)
+    shape = np.clip(np.mean([np.divide(*np.ptp(window, axis=0)[::-1]) for window in windows]), 0.5, 1.4)
+    width = 8.0 if columns == 1 else 4.6
+    figure = new_figure(width * columns, width * shape * rows + 1.2)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axis, window in zip(axes, windows, strict=False):
+        draw_layers(axis, ground, layers, window)
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(alpha=0.2)
+    for axis in axes[len(shown) :]:
+        axis.set_visible(False)
+    if len(shown) < len(counts):
+        text = f"{len(counts) - len(shown)} smaller places not shown"
+        axes[len(shown) - 1].annotate(text, (1, -0.2), fontsize=8, xycoords="axes fraction", ha="right")
+    return figure, places, list(zip(axes, shown.tolist(), windows, strict=False))
+
+
+def ground_axes(up: ArrayLike, unit: str | None = "m") -> tuple[Floats, list[str]]:
+    """Return the right and the upward axis of a picture from above, (2, 3), and their labels.
+
+    If `up` is a world axis, the two are world axes, so the picture shows world coordinates.
+
+    Args:
+        up: up direction (3,).
+        unit: unit of the coordinates, None if unknown.
+    """
+    up = np.asarray(up, np.float64) / np.linalg.norm(up)
+    axis = int(np.argmax(np.abs(up)))
+    first = np.eye(3)[0 if axis != 0 else 1]
+    right = first - up * (first @ up)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(up, right)])
+    labels, in_unit = [], f" [{unit}]" if unit else ""
+    for row in axes:
+        k = int(np.argmax(np.abs(row)))
+        sign = "−" if row[k] < 0 else ""
+        labels.append((f"{sign}{'xyz'[k]}" if abs(row[k]) > 0.99 else "along the ground") + in_unit)
+    return axes, labels
+
+
+def places_of(positions: Floats) -> Ints:
+    """Cluster positions (N, 2 or 3) into places; return place numbers (N,), from 0 in order of appearance.
+
+    Places are apart by more than 12 % of the whole extent and by more than five times the median step to a neighbor.
+    """
+    from scipy.cluster.hierarchy import fcluster, linkage
+    from scipy.spatial import cKDTree
+
+    if len(positions) < 2:
+        return np.zeros(len(positions), np.int64)
+    extent = float(np.linalg.norm(np.ptp(positions, axis=0)))
+    # Merge positions on one spot (cameras of a rig), which would bias the step; about a thousand spots suffice.
+    spots = np.unique(np.round(positions / max(extent / 400, 1e-9)), axis=0) * max(extent / 400, 1e-9)
+    spots = spots[:: len(spots) // 1500 + 1]
+    if len(spots) < 2:
+        return np.zeros(len(positions), np.int64)
+    tree = linkage(spots, "single")
+    gap = max(5.0 * float(np.median(tree[:, 2])), 0.12 * extent)
+    labels = fcluster(tree, gap, "distance")[cKDTree(spots).query(positions)[1]]
+    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[inverse]

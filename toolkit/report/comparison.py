@@ -1,0 +1,458 @@
+"""Compare runs: recall with intervals, queries won and lost, time, memory, and settings that differ.
+
+Everything is read from the files of the runs; no query is localized again.
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from toolkit.capture.devices import extra_devices
+from toolkit.capture.names import allow_outside
+from toolkit.errors import ArtifactError, ToolkitError
+from toolkit.figures.inspection import InspectedPair
+from toolkit.figures.stills import draw_localization
+from toolkit.figures.style import BLUE, GREEN, ORANGE, SKY, VERMILLION, new_figure, number, percent, styled
+from toolkit.files import SceneFiles, require_current, require_whole
+from toolkit.geometry import Floats, Ints
+from toolkit.report.page import off_by, read_run, seconds_text, threshold_text
+from toolkit.results.metrics import is_below, named_as_meters, parse_threshold, unit_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+RESAMPLES, SEED = 2000, 0
+INTERVAL = (2.5, 97.5)
+"""Percentiles of the resamples that bound an interval."""
+ALL = "all"
+"""Value of the scene and device columns in rows that sum over all pairs."""
+MOST_ROWS, MOST_LETTERS = 20, 32
+"""Queries won or lost that are listed; letters of an image name beyond which only the file name is shown."""
+QUERY = ["scene", "map_device", "query_device", "timestamp", "device_id"]
+_PAIR = QUERY[:3]
+_ERRORS = ["rotation_error_deg", "translation_error_m"]
+_RESULT = ["status", *_ERRORS]
+# Manifest keys that differ between any two runs, so they are not compared.
+_NAMES = ["name", "description", "output_root"]
+_COLORS = (VERMILLION, BLUE, GREEN, ORANGE, SKY)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Runs compared on the queries that all of them evaluated; the first run is the baseline."""
+
+    folders: Sequence[Path]
+    names: Sequence[str]
+    """Of the runs; each is different."""
+    records: Sequence[Mapping[str, Any]]
+    """Content of each `run.json`."""
+    thresholds: Sequence[str]
+    """Names, such as `(1deg,0.1m)`."""
+    queries: pd.DataFrame
+    """One row per common query and pair. Columns `QUERY`; `status_<i>`, `rotation_error_deg_<i>` and
+    `translation_error_m_<i>` of each run i; `image`, the image name, unless the runs are too old to have it."""
+    recall: pd.DataFrame
+    """One row per pair, threshold and run, and the same for all pairs together: recall and its difference to the first
+    run (0 to 1), each with the `_low` and `_high` of its interval; numbers of queries, won and lost."""
+    changes: pd.DataFrame
+    """The rows of `queries` that a run won or lost, with the columns run, change, at (thresholds)."""
+    settings: pd.DataFrame
+    """Settings that differ, by their key; one column per run."""
+    resources: pd.DataFrame
+    """seconds and memory_mb, by stage and run; the last stage is all of them."""
+    messages: Sequence[str]
+
+    def text(self) -> str:
+        """Return a short table of all pairs together, with the numbers of queries won and lost."""
+        tables, pairs = readable(self), self.queries.groupby(_PAIR).ngroups
+        recall = tables["recall"].xs((ALL, ALL), level=["map", "query"]).drop(columns="queries")
+        resources = tables["resources"].loc[ALL]
+        parts = [f"{len(self.queries)} queries in {pairs} pairs, recall in % [95 %]", recall.to_string()]
+        parts += ["time and peak memory; reused results, also those of another run, count as none"]
+        parts += [resources.to_string()] + ([self.settings.to_string()] if len(self.settings) else [])
+        return "\n".join([*parts, *(f"Note: {message}" for message in self.messages)])
+
+    def summary(self) -> dict[str, Any]:
+        """Return the comparison as plain values for scripts, with every pair and every query won or lost."""
+
+        def plain(table: pd.DataFrame) -> list[dict[str, Any]]:  # JSON has neither infinity nor NaN
+            return list(json.loads(table.to_json(orient="records", double_precision=15)))
+
+        stages = self.resources.groupby("stage", sort=False)
+        return {
+            "runs": dict(zip(self.names, map(str, self.folders), strict=True)),
+            "queries": len(self.queries),
+            "recall": plain(self.recall),
+            "changes": plain(self.changes),
+            "settings": self.settings.to_dict("index"),
+            "resources": {stage: dict(zip(self.names, plain(rows), strict=True)) for stage, rows in stages},
+            "messages": list(self.messages),
+        }
+
+
+def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: int = RESAMPLES) -> Comparison:
+    """Compare runs with the first of them, on the queries of each pair that all of them evaluated.
+
+    A run wins a query at a threshold if it is within the threshold and the first run is not; it loses a query if the
+    first run is within the threshold and it is not. Intervals are paired 95 % percentile bootstrap intervals (Efron
+    and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 13): every resample takes the same queries from all
+    runs. Resamples draw a query that was localized in several maps as one unit, because its poses are not independent.
+    If all or none of the queries are within a threshold, the interval has no width; this proves nothing about other
+    queries.
+
+    Args:
+        run_dirs: run folders, two or more.
+        seed: seed of the resamples.
+        resamples: number of resamples.
+
+    Raises:
+        ArtifactError: a folder is not a run, is not evaluated, has a torn table or no query with ground truth; or the
+            runs have no query in common, or their lengths have different units.
+    """
+    if isinstance(run_dirs, str) or len(run_dirs) < 2:
+        raise ArtifactError(f"compare: found {run_dirs!r}, expected a list of two or more run folders.")
+    folders = list(map(Path, run_dirs))
+    records = [read_run(folder / "run.json") for folder in folders]
+    tables = [_read_errors(folder, record) for folder, record in zip(folders, records, strict=True)]
+    names, messages = _names(folders), list[str]()
+    limits = [[name.removeprefix("loss@") for name in table if name.startswith("loss@")] for table in tables]
+    units = [unit_of(*names_of) for names_of in limits]
+    for folder, record, unit, limit in zip(folders, records, units, limits, strict=True):
+        if unit != units[0]:
+            raise ArtifactError(
+                f"{folder}: found errors in {unit}, expected {units[0]} as in {folders[0]}. Set the same `unit` for "
+                "both, and run them again."
+            )
+        if record["status"] not in ("done", ""):
+            messages.append(f"{folder.name} is {record['status']}: {record['error'] or 'it has not ended'}")
+        if limit != limits[0]:
+            messages.append(f"{folder.name} was evaluated at other thresholds; those of {names[0]} are used.")
+    keys = [*QUERY, *(["sensor_id"] if all("sensor_id" in table for table in tables) else [])]
+    for folder, table in zip(folders, tables, strict=True):
+        if table.duplicated(keys).any():
+            raise ArtifactError(
+                f"{folder}: evaluation/errors.csv has a query twice, expected one row each. Perhaps this run was "
+                "evaluated at each camera and the others at each device; evaluate it with the same `at` as the others."
+            )
+    results = [table.set_index(keys)[_RESULT].add_suffix(f"_{i}") for i, table in enumerate(tables)]
+    images = tables[0].set_index(keys).filter(["image"])
+    queries = pd.concat([images, *results], axis="columns", join="inner").reset_index()
+    counts = ", ".join(f"{name} {len(table)}" for name, table in zip(names, tables, strict=True))
+    if queries.empty:
+        raise ArtifactError(
+            f"The runs have no query in common ({counts}). Compare runs of the same capture, pairs and queries."
+        )
+    if any(len(table) > len(queries) for table in tables):
+        messages.append(f"The runs have different queries ({counts}); only the {len(queries)} in common are compared.")
+    for scene in queries["scene"].unique():
+        if len({str(record["inputs"].get(scene)) for record in records}) > 1:
+            messages.append(f"{scene}: its files were changed, moved or copied between the runs.")
+    errors = [queries[[f"{name}_{i}" for name in _ERRORS]].to_numpy(float).T for i in range(len(tables))]
+    limits_of = [parse_threshold(name) for name in limits[0]]
+    hits = np.array([[is_below(turned, moved, limit) for limit in limits_of] for turned, moved in errors])
+    hits = np.moveaxis(hits, 2, 0)  # (Q, R, T), whether each query is within each threshold in each run
+    return Comparison(
+        *(folders, names, records, limits[0], queries),
+        _recall(queries, hits, names, limits[0], seed, resamples),
+        _changes(queries, hits, names, limits[0]),
+        _settings({name: record["manifest"] for name, record in zip(names, records, strict=True)}),
+        _resources({name: record["stages"] for name, record in zip(names, records, strict=True)}),
+        messages,
+    )
+
+
+def bootstrap(
+    hits: NDArray[np.bool_], unit: Ints, seed: int = SEED, resamples: int = RESAMPLES
+) -> tuple[Floats, Floats]:
+    """Return intervals of each run's recall and of its difference to the first run; each (2, R, T), 0 to 1.
+
+    Args:
+        hits: (Q, R, T), whether each query is within each threshold in each run.
+        unit: (Q,) numbers from 0; queries of the same number are drawn together.
+        seed: seed of the resamples.
+        resamples: number of resamples.
+    """
+    count = np.bincount(unit)
+    sums = np.zeros((len(count), *hits.shape[1:]))
+    np.add.at(sums, unit, hits)
+    rng, shares = np.random.default_rng(seed), []
+    # In blocks: each resample has a weight for every unit, which takes memory.
+    steps = [*range(0, resamples, max(1, 2_000_000 // len(count))), resamples]
+    for start, end in pairwise(steps):
+        weights = rng.multinomial(len(count), np.full(len(count), 1 / len(count)), size=end - start)
+        shares.append(np.tensordot(weights, sums, 1) / (weights @ count)[:, None, None])
+    drawn = np.concatenate(shares)
+    recall, difference = (np.percentile(shares, INTERVAL, axis=0) for shares in (drawn, drawn - drawn[:, :1]))
+    return recall, difference
+
+
+# Reading
+
+
+def _read_errors(folder: Path, record: Mapping[str, Any]) -> pd.DataFrame:
+    """Return the errors of all queries with ground truth of all scenes of a run, with a column `scene`."""
+    tables, missing = [], []
+    for scene in map(str, record["scenes"]):
+        path = SceneFiles(folder, scene).evaluation / "errors.csv"
+        if not path.is_file():
+            missing.append(str(path))
+            continue
+        require_whole(path, of=path.with_name("recall.csv"))
+        require_current(path.with_name("recall.csv"), "evaluate")
+        try:
+            types = {"timestamp": np.int64, "device_id": str, "sensor_id": str, "status": str}
+            table = pd.read_csv(path, dtype={**types, **dict.fromkeys(_ERRORS, float)})
+        except (OSError, ValueError, OverflowError) as error:
+            raise ArtifactError(f"{path}: not a table of errors ({error}). Run its stage evaluate again.") from None
+        table = named_as_meters(table)
+        if lacking := [name for name in (*QUERY[1:], *_RESULT) if name not in table]:
+            raise ArtifactError(f"{path}: column {lacking[0]!r} is missing. Run its stage evaluate again.")
+        if not any(name.startswith("loss@") for name in table):
+            raise ArtifactError(f"{path}: a column `loss@...`, which names a threshold, is missing. Evaluate again.")
+        tables.append(table.assign(scene=scene))
+    if not tables:
+        raise ArtifactError(
+            f"{folder}: not evaluated ({missing[0]} is missing). Finish the run: python -m toolkit run MANIFEST."
+            if missing
+            else f"{folder}: found no scene in run.json, expected the scenes of a run. Run its manifest again."
+        )
+    errors = pd.concat(tables, ignore_index=True)
+    errors = errors[errors[_ERRORS].notna().all(axis=1)]
+    if errors.empty:
+        raise ArtifactError(
+            f"{folder}: found no query with ground truth, expected at least one: recall needs true poses. Add ground "
+            "truth to the query sessions and evaluate again."
+        )
+    return errors
+
+
+def _names(folders: Sequence[Path]) -> list[str]:
+    """Return a short, unique name for each run."""
+    names = [folder.resolve().name for folder in folders]
+    return [f"{name} ({i})" if names.count(name) > 1 else name for i, name in enumerate(names, 1)]
+
+
+# Counting
+
+
+def _recall(
+    queries: pd.DataFrame,
+    hits: NDArray[np.bool_],
+    names: Sequence[str],
+    thresholds: Sequence[str],
+    seed: int,
+    resamples: int,
+) -> pd.DataFrame:
+    groups = {**queries.groupby(_PAIR, sort=False).indices, (ALL, ALL, ALL): np.arange(len(queries))}
+    index = pd.MultiIndex.from_product([thresholds, names], names=["threshold", "run"])
+    tables = {}
+    for pair, chosen in groups.items():
+        within, first = hits[chosen], hits[chosen][:, :1]
+        unit = queries.iloc[chosen].groupby(["scene", "timestamp", "device_id"], sort=False).ngroup().to_numpy()
+        recall, difference = bootstrap(within, unit, seed, resamples)
+        shares = within.mean(axis=0)
+        of_runs = {
+            "recall": shares, "recall_low": recall[0], "recall_high": recall[1],
+            "difference": shares - shares[0], "difference_low": difference[0], "difference_high": difference[1],
+            "won": (within & ~first).sum(axis=0), "lost": (first & ~within).sum(axis=0),
+        }  # fmt: skip
+        columns = {name: values.T.ravel() for name, values in of_runs.items()}
+        tables[pair] = pd.DataFrame({"queries": len(chosen), **columns}, index)
+    return pd.concat(tables, names=_PAIR).reset_index()
+
+
+def _changes(
+    queries: pd.DataFrame, hits: NDArray[np.bool_], names: Sequence[str], thresholds: Sequence[str]
+) -> pd.DataFrame:
+    """List for each run the queries lost, then those won; those that changed at the most thresholds first."""
+    parts = []
+    for run, name in enumerate(names[1:], 1):
+        for change, changed in (("lost", hits[:, 0] & ~hits[:, run]), ("won", ~hits[:, 0] & hits[:, run])):
+            order = np.argsort(-changed.sum(axis=1), kind="stable")
+            chosen = order[changed[order].any(axis=1)]
+            at = ["; ".join(np.array(thresholds)[changed[k]]) for k in chosen]
+            parts.append(queries.iloc[chosen].assign(run=name, change=change, at=at))
+    return pd.concat(parts, ignore_index=True)
+
+
+def _settings(manifests: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
+    """Return the settings that differ between runs, as texts."""
+    columns = {name: pd.json_normalize(dict(manifest)).T.astype(str) for name, manifest in manifests.items()}
+    table = pd.concat(columns, axis="columns").droplevel(1, axis="columns").drop(_NAMES, errors="ignore").fillna("–")
+    return table[table.nunique(axis="columns") > 1]
+
+
+def _resources(stages: Mapping[str, Sequence[Mapping[str, Any]]]) -> pd.DataFrame:
+    rows = [
+        (stage, name, row.get("seconds") or 0.0, row.get("peak_memory_mb") or 0.0)
+        for name, of_run in stages.items()
+        for row in of_run
+        for stage in (str(row.get("stage")), ALL)
+    ]
+    table = pd.DataFrame(rows, columns=["stage", "run", "seconds", "memory_mb"])
+    all_stages = [*(name for name in table["stage"].unique() if name != ALL), ALL]
+    every = pd.MultiIndex.from_product([all_stages, stages], names=["stage", "run"])
+    return table.groupby(["stage", "run"]).agg({"seconds": "sum", "memory_mb": "max"}).reindex(every)
+
+
+# Showing
+
+
+@styled
+def draw_differences(comparison: Comparison) -> "Figure":
+    """Draw for each pair the difference of recall to the first run, with its interval."""
+    others = comparison.names[1:]
+    table = comparison.recall[comparison.recall["run"] != comparison.names[0]]
+    pairs = list(dict.fromkeys(map(tuple, table[_PAIR].to_numpy())))
+    several = table["scene"].nunique() > 2
+    labels = [
+        "all pairs" if pair[0] == ALL else f"{f'{pair[0]}: ' * several}{pair[2]} in {pair[1]} map" for pair in pairs
+    ]
+    figure = new_figure(3.6 * len(comparison.thresholds) + 1.5, 0.24 * len(pairs) * max(2, len(others)) + 1.4)
+    panels = np.ravel(figure.subplots(1, len(comparison.thresholds), sharey=True, sharex=True, squeeze=False))
+    for panel, threshold in zip(panels, comparison.thresholds, strict=True):
+        for k, run in enumerate(others):
+            rows = table[(table["run"] == run) & (table["threshold"] == threshold)]
+            middle, low, high = 100 * rows[["difference", "difference_low", "difference_high"]].to_numpy(float).T
+            y = np.arange(len(pairs)) + 0.6 * ((k + 1) / (len(others) + 1) - 0.5)
+            color = _COLORS[k % len(_COLORS)]
+            panel.hlines(y, low, high, color=color, lw=2)
+            panel.plot(middle, y, "o", color=color, ms=5, label=run)
+        panel.axvline(0, color="0.4", lw=0.8)
+        panel.set(title=f"at {threshold_text(threshold)}", xlabel="difference of recall [percentage points]")
+        panel.set_yticks(range(len(pairs)), labels)
+    panels[0].invert_yaxis()
+    lowest, highest = panels[0].get_xlim()
+    panels[0].set_xlim(min(lowest, -5), max(highest, 5))  # small differences should look small
+    figure.suptitle(f"Recall minus that of {comparison.names[0]}, with intervals of 95 %")
+    if len(others) > 1:
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    return figure
+
+
+def readable(comparison: Comparison) -> dict[str, pd.DataFrame]:
+    """Return the tables as texts: `recall`, `changes`, `resources`, `settings` and `origins`; some may be empty."""
+    origins = {
+        name: {"folder": str(folder), "created": record["created"], "code": record["code"] or "not known",
+               "cores": record["machine"].get("cores", "?"), **record["versions"]}
+        for name, folder, record in zip(comparison.names, comparison.folders, comparison.records, strict=True)
+    }  # fmt: skip
+    seconds, memory_mb = comparison.resources["seconds"], comparison.resources["memory_mb"]
+    return {
+        "recall": _readable_recall(comparison),
+        "changes": _readable_changes(comparison),
+        "resources": pd.DataFrame({"time": seconds.map(seconds_text), "peak memory": memory_mb.map(_memory)}),
+        "settings": comparison.settings,
+        "origins": pd.DataFrame(origins).fillna("–"),
+    }
+
+
+def _readable_recall(comparison: Comparison) -> pd.DataFrame:
+    """List recall in %, with its interval, and the differences in percentage points, one threshold after the other."""
+    table = pd.concat(of_limit for _, of_limit in comparison.recall.groupby("threshold", sort=False))
+    rows = table.to_dict("records")
+    table["at"], table["recall"] = table["threshold"].map(threshold_text), [_interval(row, "recall") for row in rows]
+    table["difference"] = [_interval(row, "difference") for row in rows]
+    changes = ["difference", "won", "lost"]  # the first run is compared with itself
+    table[changes] = table[changes].astype(object).where(table["run"] != comparison.names[0], "")
+    index = ["at", *(["scene"] if table["scene"].nunique() > 2 else []), "map", "query", "run"]
+    table = table.rename(columns={"map_device": "map", "query_device": "query"}).set_index(index)
+    return table[["queries", "recall", *changes]]
+
+
+def _readable_changes(comparison: Comparison) -> pd.DataFrame:
+    """List the queries won and lost, or a regular sample of `MOST_ROWS` of them."""
+    table, unit = comparison.changes, unit_of(*comparison.thresholds)
+    rows = table.loc[_spread(range(len(table)), MOST_ROWS)].to_dict("records")
+    numbers = [comparison.names.index(row["run"]) for row in rows]
+    shown = pd.DataFrame({
+        "run": [row["run"] for row in rows],
+        "change": [row["change"] for row in rows],
+        "at": [_limits(comparison, row["at"]) for row in rows],
+        "query": [f"{row['query_device']} in {row['map_device']} map" for row in rows],
+        f"off in {comparison.names[0]}": [off_by(row, after="_0", unit=unit) for row in rows],
+        "off in the run": [off_by(row, after=f"_{i}", unit=unit) for i, row in zip(numbers, rows, strict=True)],
+        "status": [row[f"status_{i}"].replace("_", " ") for i, row in zip(numbers, rows, strict=True)],
+        "image": list(map(_name, rows)),
+    })  # fmt: skip
+    return shown.set_index("run")
+
+
+def draw_changes(comparison: Comparison, most: int) -> "Iterator[tuple[str, list[tuple[str, Figure]]]]":
+    """Draw a regular sample of the queries won and lost; yield a title, and the titles and figures of both runs.
+
+    Without figures, the title says why that query cannot be drawn: the capture has moved, or a run has not kept the
+    correspondences.
+
+    Args:
+        most: number of queries of each run; half of them lost and half won, if there are enough of both.
+    """
+    table = comparison.changes
+    for run in comparison.names[1:]:
+        rows = [table.index[(table["run"] == run) & (table["change"] == change)].tolist() for change in ("lost", "won")]
+        half = max(most // 2, most - len(rows[1]))
+        lost = _spread(rows[0], half)
+        for row in [*lost, *_spread(rows[1], most - len(lost))]:
+            change = table.loc[row].to_dict()
+            query = f"{change['query_device']} query {_name(change)}"
+            outcome = f"{change['change']} by {run} at {_limits(comparison, change['at'])}"
+            try:
+                drawn = [_draw_query(comparison, change, name) for name in (comparison.names[0], run)]
+                yield f"{query} in the {change['map_device']} map: {outcome}", drawn
+            except (ToolkitError, OSError) as error:
+                yield f"No picture of {query}: {error}", []
+
+
+def _draw_query(comparison: Comparison, query: Mapping[str, Any], run: str) -> "tuple[str, Figure]":
+    """Draw a query as a run has localized it, from stored correspondences; return also a title."""
+    i = comparison.names.index(run)
+    manifest, files = comparison.records[i]["manifest"], SceneFiles(comparison.folders[i], query["scene"])
+    with extra_devices(manifest.get("extra_devices", [])), allow_outside(manifest.get("allow_outside", False)):
+        pair = InspectedPair(query["map_device"], query["query_device"], files.poses_dir).localized
+        with closing(pair.queries):
+            same = (pair.table["timestamp"] == query["timestamp"]) & (pair.table["device_id"] == query["device_id"])
+            if not same.any():
+                raise ArtifactError(f"{files.poses_dir / pair.name}.csv: no row of query {query['timestamp']}.")
+            k = int(np.flatnonzero(same)[0])
+            title = f"{run}: {pair.table['status'].iloc[k]}"
+            return title, draw_localization(pair.details(k), title=title, unit=pair.unit)
+
+
+def _name(change: Mapping[str, Any]) -> str:
+    """Return the name of a query: its image name, shortened to the file name if long; else its timestamp."""
+    image = change.get("image")
+    name = image if isinstance(image, str) else str(change["timestamp"])
+    return name if len(name) <= MOST_LETTERS else f"…/{name.rpartition('/')[2]}"
+
+
+def _spread(rows: Sequence[int], most: int) -> list[int]:
+    """Return a regular sample of the rows: neighboring rows belong to one pair and look alike."""
+    return [rows[k] for k in np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int))]
+
+
+def _limits(comparison: Comparison, at: str) -> str:
+    names = at.split("; ")
+    if len(names) == len(comparison.thresholds) > 1:
+        return "every threshold"
+    return "; ".join(map(threshold_text, names))
+
+
+def _signed(share: float) -> str:
+    return f"{'+' if share > 0 else '−' if share < 0 else ''}{percent(abs(share))}"
+
+
+def _interval(row: Mapping[str, Any], name: str) -> str:
+    write = _signed if name == "difference" else percent
+    return f"{write(row[name])} [{write(row[f'{name}_low'])}, {write(row[f'{name}_high'])}]"
+
+
+def _memory(megabytes: float) -> str:
+    return f"{number(megabytes)} MB" if megabytes > 0 else "–"

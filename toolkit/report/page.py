@@ -1,0 +1,663 @@
+"""Write the report of a run: report.html, one self-contained file."""
+
+import base64
+import glob
+import json
+import math
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+from zlib import crc32
+
+import pandas as pd
+from markupsafe import Markup, escape
+
+from toolkit.capture.tables import POSES_UNIT
+from toolkit.errors import ArtifactError
+from toolkit.figures.png import as_jpeg
+from toolkit.figures.sequences import CHANGES
+from toolkit.figures.style import number, percent
+from toolkit.files import (
+    SceneFiles,
+    of_sequence,
+    older_files,
+    pair_devices,
+    read_json,
+    read_map_record,
+    sidecar_path,
+    write_text,
+)
+from toolkit.results.metrics import (
+    REASONS,
+    THRESHOLDS,
+    WRONG,
+    is_below,
+    length_unit,
+    named_as_meters,
+    parse_threshold,
+    small_unit,
+    unit_of,
+    worst_first,
+)
+
+Write = Callable[[Any], str]
+"""Function that writes a number of a table."""
+PICTURE_BUDGET = 7_000_000
+"""Bytes of all pictures of a page. Base64 makes them a third larger, so the page stays below 10 MB."""
+MAX_WIDTH = 1600
+"""Width of an embedded picture, pixels, at most."""
+WORST, MOST_REASONS = 10, 12
+"""Rows listed for a scene: the worst queries, and the reasons why queries have no pose."""
+LONG = 30
+"""Letters from which the text of a table is wrapped."""
+LINKED = {
+    "Recordings in 3D, opened by .venv/bin/rerun FILE": "visualization/*.rrd",
+    "Tables of the evaluation": "evaluation/*.csv",
+    "Poses, device to world": "poses/*.txt",
+    "Statuses, a row for each query": "poses/*.csv",
+    "References, a line for each image": "retrieval/*.jsonl",
+}
+STATUS_COLUMNS = [
+    "timestamp", "device_id", "image", "reason", "status", "num_inliers", "position_std_m", "seconds",
+    "first_status", "first_seconds",
+]  # fmt: skip
+# Figures that say more than the page's tables: a heading, and how to read each.
+EVALUATION_FIGURES = {
+    "error_curves": (
+        "Error curves",
+        "Share of queries [%] with a position error (top) and a rotation error (bottom) below x. A curve ends at the "
+        "share of queries that have a pose; dotted lines are the thresholds of the tables.",
+    ),
+    "reliability": (
+        "Reliability",
+        "Share of poses that are right against the stated probability (p_correct), with 95 % intervals and "
+        "the number of poses. On the dotted line both agree; ok means 99 % or more.",
+    ),
+    "deviations": (
+        "Stated and actual deviation",
+        "Position error of each pose against its stated standard deviation (position_std in poses/*.csv). With 30 "
+        "poses or more, a line joins the median of each tenth. Poses above the dashed line are off by more than five "
+        "deviations.",
+    ),
+    "losses": (
+        "Where accuracy was lost",
+        "Causes of the misses at each threshold, in % of the queries. No good reference: retrieval found no map "
+        "image near the true camera; no pose: too few matches agreed; wrong pose: beyond the threshold.",
+    ),
+}
+
+
+@dataclass
+class Picture:
+    data: str
+    """data: URL; empty if the page has no room left."""
+    title: str
+    caption: str
+    path: str
+    """Relative to the run folder."""
+    wide: bool = False
+    """Too wide to be readable when scaled to a phone."""
+
+
+def write_report(run_dir: str | Path) -> Path:
+    """Write `report.html` from the `run.json`, tables and pictures of a run folder, and return its path.
+
+    Pictures are embedded, so the file can be mailed alone. Links to poses, notebooks and recordings are relative to
+    the run folder. The report leaves out missing files and names unreadable ones. It shows the pictures in the folder
+    `visualization` by name: `worst*` with the worst queries, `localization*` as samples, `<pair>_sequence*` with the
+    sequences, all remaining ones as maps. A picture's title is the PNG's `Title` or `Description`.
+
+    Raises:
+        ArtifactError: `run.json` is missing or torn.
+    """
+    from jinja2 import StrictUndefined, Template
+
+    run_dir = Path(run_dir)
+    run = read_run(run_dir / "run.json")
+    left_out: list[str] = []
+    scenes = []
+    for name in map(str, run["scenes"]):
+        # Every scene gets an equal share, or the first scenes would leave no room for the last.
+        album = Album(run_dir, PICTURE_BUDGET // len(run["scenes"]), left_out)
+        scenes.append(_scene(SceneFiles(run_dir, name), str(run["inputs"].get(name, "")), album))
+    source = Path(__file__).with_suffix(".html.j2").read_text(encoding="utf-8")
+    template = Template(source, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    page = template.render(
+        run=run,
+        scenes=scenes,
+        stages=_stages(run, run_dir),
+        stopped=[row for row in run["stages"] if row.get("status") in ("failed", "interrupted", "skipped")],
+        not_done=_not_done(run),
+        summary=_summary(run),
+        manifest=_json(run["manifest"]),
+        parameters=[(_stage_name(row), _json(row["parameters"])) for row in run["stages"] if row.get("parameters")],
+        left_out=left_out,
+    )
+    write_text(run_dir / "report.html", page)
+    return run_dir / "report.html"
+
+
+def read_run(path: Path) -> dict[str, Any]:
+    """Return the content of a `run.json`, with empty values for missing keys.
+
+    Raises:
+        ArtifactError: the file is missing, torn, or not a record of a run.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ArtifactError(f"No run at {path.parent}: {path.name} is missing. Run a manifest first.") from None
+    except ValueError as error:
+        raise ArtifactError(f"{path} is not valid JSON ({error}). Run the manifest again.") from None
+    if not isinstance(content, dict):
+        raise ArtifactError(f"{path}: expected a JSON object, found a {type(content).__name__}.")
+    empty = {"name": path.parent.name, "created": "", "status": "", "error": None, "total_seconds": None}
+    lists: dict[str, Any] = {"manifest": {}, "versions": {}, "machine": {}, "inputs": {}, "scenes": [], "stages": []}
+    run = {**empty, "peak_memory_mb": None, "work_seconds": None, "code": "", **lists, **content}
+    wrong = [key for key, value in lists.items() if not isinstance(run[key], type(value))]
+    if wrong or not all(isinstance(row, dict) for row in run["stages"]):
+        key = wrong[0] if wrong else "stages"
+        raise ArtifactError(f"{path}: {key!r} is not as a run writes it. Run the manifest again.")
+    run["scenes"] = run["scenes"] or list(dict.fromkeys(row["scene"] for row in run["stages"] if row.get("scene")))
+    return run
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, indent=2, ensure_ascii=False)
+
+
+# The run: time, memory, machine
+
+
+def _summary(run: dict[str, Any]) -> list[tuple[str, str]]:
+    parts = [("started", str(run["created"]).replace("T", " ").replace("+00:00", " UTC"))]
+    if run["total_seconds"] is not None:
+        work = run["work_seconds"]
+        detail = f" ({seconds_text(work)} of work besides the notebooks' start-up)" if work is not None else ""
+        parts.append(("time", seconds_text(run["total_seconds"]) + detail))
+    if run["peak_memory_mb"]:
+        parts.append(("peak memory", f"{run['peak_memory_mb'] / 1000:.2f} GB"))
+    # The page lists Python's version with the other versions.
+    machine = ", ".join(
+        f"{value} {key}" if key == "cores" else str(value) for key, value in run["machine"].items() if key != "python"
+    )
+    return [*parts, ("machine", machine)] if machine else parts
+
+
+def _stage_name(row: dict[str, Any]) -> str:
+    return " ".join(str(part) for part in (row.get("scene"), row.get("stage"), row.get("part")) if part)
+
+
+def _stages(run: dict[str, Any], run_dir: Path) -> Markup:
+    rows = []
+    for row in run["stages"]:
+        counts = ", ".join(f"{value} {key.replace('_', ' ')}" for key, value in (row.get("counts") or {}).items())
+        rows.append({
+            "scene": row.get("scene") or "",
+            "stage": _anchor(_stage_name({**row, "scene": ""}), run_dir, run_dir / str(row.get("notebook") or "")),
+            "status": row.get("status", ""),
+            "time": row.get("seconds"),
+            "of it work": row.get("work_seconds", row.get("kernel_seconds")),
+            "peak memory": row.get("peak_memory_mb") or None,
+            "counts": counts,
+        })  # fmt: skip
+    numbers: dict[str, Write] = {"time": seconds_text, "of it work": seconds_text, "peak memory": "{:.0f} MB".format}
+    # As objects, or pandas would turn links into plain text.
+    frame = pd.DataFrame(rows, dtype=object).astype(dict.fromkeys(numbers if rows else (), float))
+    caption = "Time and peak memory of every stage; names link to the executed notebooks"
+    return _table(frame, caption, numbers, ["time", "peak memory"])
+
+
+def _not_done(run: dict[str, Any]) -> Markup:
+    """List the items that stages left out, and why."""
+    rows = [
+        (str(row.get("scene") or ""), str(item.get("what", "")), str(item.get("reason", "")), str(row.get("stage", "")))
+        for row in run["stages"]
+        for item in row.get("left_out") or ()
+    ]
+    table = pd.DataFrame(rows, columns=["scene", "what", "reason", "stages"]).drop_duplicates()
+    stages = table.groupby(["scene", "what", "reason"], sort=False)["stages"].agg(", ".join)
+    return _table(stages.reset_index(), "Left out, and why")
+
+
+# A scene
+
+
+def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any]:
+    """Return the template variables of one scene."""
+    messages: list[str] = []
+    tables = ("recall", "errors", "losses", "retrieval", "sequence", "changes")
+    older, older_pictures = older_files(files.evaluation, "evaluate"), older_files(files.visualization, "visualize")
+    recall, errors, losses, retrieval, sequences, changes = (
+        pd.DataFrame() if f"{name}.csv" in older else _read_table(files.evaluation / f"{name}.csv", messages)
+        for name in tables
+    )
+    thresholds = [column for column in recall.columns if column.startswith("recall@")]
+    statuses = _read_statuses(files, messages)
+    messages += [f"Not shown: {why}" for why in dict.fromkeys(older.values())]
+    if older_pictures:
+        first = next(iter(older_pictures.values()))
+        messages.append(f"Not shown: {len(older_pictures)} pictures and recordings. {first}")
+    older |= older_pictures
+    made = {"localize": files.poses_dir, "rerank": files.reranked_dir, "retrieve": files.retrieval_dir}
+    for stage, folder in made.items():
+        messages += list(older_files(folder, stage).values())[:1]
+    if len(recall):
+        messages += read_json(sidecar_path(files.evaluation / "recall.csv")).get("settings", {}).get("messages", [])
+    unit = unit_of(*thresholds)
+    small, factor = small_unit(unit)
+    remarks, lengths = list[str](), list[str]()
+    for path in sorted(files.poses_dir.glob(f"{glob.escape(files.scene)}_map_*.json")):
+        record = read_map_record(path)
+        remarks += [f"{path.stem}: {record['text']}"] if record["text"] else []
+        lengths += [f"{length_unit(record)[1]:.3g} in {path.stem}"] if record["depth"] else []
+    if unit != "m":
+        depth = f"a tenth of the median scene depth of a map{': ' if lengths else ''}{', '.join(lengths)}"
+        remarks.append(f"The unit of the poses is not known: {unit} is {depth}.")
+    verdict, headlines = _verdict(recall, errors, statuses, thresholds)
+    matrices, note = _retrieval(retrieval, headlines, unit)
+    stills = sorted((path for path in files.visualization.glob("*.png") if path.name not in older), key=_natural)
+    worst = [path for path in stills if path.name.startswith("worst")]
+    samples = [path for path in stills if path.name.startswith("localization")]
+    recordings = [path for path in stills if of_sequence(path.name)]
+    maps = [path for path in stills if path not in (*worst, *samples, *recordings)]
+    figures = {files.evaluation / f"{name}.png": texts for name, texts in EVALUATION_FIGURES.items()}
+    return {
+        "name": files.scene,
+        "fingerprint": fingerprint,
+        "verdict": verdict,
+        "wrong_ok": _wrong_ok(errors, unit),
+        "headlines": headlines,
+        "messages": messages,
+        "remarks": remarks,
+        "recall": [_matrix(recall, column, f"Recall at {threshold_text(column)} [%]") for column in thresholds],
+        "medians": thresholds and [
+            _matrix(recall, "median_rotation_deg", "Median rotation error [°]", number),
+            _matrix(
+                recall, "median_translation_m", f"Median translation error [{small}]", lambda v: number(v * factor)
+            ),
+        ],
+        "pairs": _pairs(recall, thresholds),
+        "losses": _losses(losses),
+        "missed": int(losses["missed"].sum()) if "missed" in losses else 0,
+        "failures": _failures(statuses),
+        "worst": _worst(errors if len(errors) else statuses, thresholds),
+        "retrieval": matrices,
+        "retrieval_note": note,
+        # Pictures of failures come first, while there is room: they are the hardest to understand from tables alone.
+        "worst_pictures": [album.picture(path) for path in worst],
+        "figures": [
+            album.picture(path, *texts) for path, texts in figures.items() if path.is_file() and path.name not in older
+        ],
+        "steps": _steps(sequences, thresholds),
+        "changes": _changes(changes, unit),
+        "sequences": [album.picture(path) for path in recordings],
+        "maps": [album.picture(path) for path in maps],
+        "samples": [album.picture(path) for path in samples],
+        "links": _links(files, older),
+    }
+
+
+def _read_table(path: Path, messages: list[str]) -> pd.DataFrame:
+    """Read a table; empty if the file is missing. An unreadable file adds a line to `messages`."""
+    try:
+        return named_as_meters(pd.read_csv(path, dtype={"device_id": str}).rename(columns=POSES_UNIT))
+    except (FileNotFoundError, pd.errors.EmptyDataError):
+        pass
+    except (OSError, ValueError) as error:
+        messages.append(f"{path.name} cannot be read ({error}). Run its stage again.")
+    return pd.DataFrame()
+
+
+def _read_statuses(files: SceneFiles, messages: list[str]) -> pd.DataFrame:
+    """Return `STATUS_COLUMNS` of every query of every pair, with or without ground truth."""
+    tables = []
+    for path in sorted(files.poses_dir.glob("*.csv")):
+        map_device, query_device = pair_devices(path.stem)
+        if map_device and query_device and not of_sequence(path.stem):
+            table = _read_table(path, messages)
+            if "status" in table:
+                table = table.reindex(columns=STATUS_COLUMNS)
+                tables.append(table.assign(map_device=map_device, query_device=query_device))
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+
+
+def _verdict(
+    recall: pd.DataFrame, errors: pd.DataFrame, statuses: pd.DataFrame, thresholds: list[str]
+) -> tuple[list[str], list[tuple[str, str]]]:
+    """Summarize the quality of the poses in sentences, and in headlines: a number and its meaning."""
+    verdict, headlines = list[str](), list[tuple[str, str]]()
+    if len(statuses):
+        pairs = len(statuses[["map_device", "query_device"]].drop_duplicates())
+        counts = statuses["status"].str.split(":").str[0].value_counts()
+        parts = ", ".join(f"{counts.get(s, 0)} {s.replace('_', ' ')}" for s in ("ok", "low_confidence", "failed"))
+        verdict.append(f"{len(statuses)} queries in {pairs} pair{'s' * (pairs != 1)} of devices: {parts}.")
+        verdict += _escalation(statuses)
+    done = recall.dropna(subset=thresholds) if thresholds else recall.iloc[:0]
+    if not len(done):
+        return verdict, headlines
+    for column in thresholds:
+        headlines.append((f"{percent(done[column].mean())} %", f"mean recall at {threshold_text(column)}"))
+    if len(errors):
+        rotation_deg, translation_m = errors[["rotation_error_deg", "translation_error_m"]].median()
+        length = _length(translation_m, unit_of(thresholds[0]))
+        headlines.append((length, f"median position error; rotation {number(rotation_deg)}°"))
+    strict = thresholds[0]
+    weakest = done.loc[done[strict].idxmin()]
+    share, limit = percent(weakest[strict]), threshold_text(strict)
+    if weakest[strict] == done[strict].max():
+        verdict.append(f"Every pair has {share} % at {limit}.")
+    else:
+        pair = f"{weakest['query_device']} queries in the {weakest['map_device']} map"
+        verdict.append(f"Weakest pair at {limit}: {pair}, {share} %.")
+    if "ok_wrong" in done:
+        wrong = float((done["ok_wrong"] * done["queries"]).sum() / done["queries"].sum())
+        what = f"called ok, but beyond {WRONG[0]:g}°, {WRONG[1]:g} {unit_of(strict)}"
+        headlines.append((f"{percent(wrong)} %", what))
+    return verdict, headlines
+
+
+def _escalation(statuses: pd.DataFrame) -> list[str]:
+    """Say in a sentence what escalation to further kinds of features gained and cost; empty without escalation."""
+    escalated = statuses[statuses["first_status"].notna()]
+    if not len(escalated):
+        return []
+    ok = (escalated["status"] == "ok").sum()
+    posed = (escalated["first_status"].str.startswith("failed") & ~escalated["status"].str.startswith("failed")).sum()
+    seconds = (escalated["seconds"] - escalated["first_seconds"]).sum()
+    gained = f", {posed} without a pose got one" if posed else ""
+    return [
+        f"{len(escalated)} were not sure and escalated to further features: {ok} are ok now{gained}. "
+        f"That took {number(seconds)} s, {number(seconds / len(escalated))} s per query."
+    ]
+
+
+# Tables
+
+
+def _table(frame: pd.DataFrame, caption: str, formats: Mapping[str, Write] = {}, bars: Sequence[str] = ()) -> Markup:
+    """Return a table as HTML, in a region that scrolls; empty if it has no rows. A named axis shows its labels.
+
+    Args:
+        formats: functions that write the numbers of columns. Without one, a number has no decimals. Shares are shaded.
+        bars: columns with bars behind their numbers.
+    """
+    from pandas.io.formats.style import Styler
+
+    if not len(frame):
+        return Markup()
+    # An identifier made from the content: equal runs should have equal pages.
+    style = Styler(frame, uuid=f"{crc32((caption + frame.to_csv()).encode()):x}", cell_ids=False)
+    style.format(lambda value: f"{value:.0f}" if isinstance(value, float) else escape(value), na_rep="–")
+    for name in frame.columns.intersection([*formats]):
+        style.format(formats[name], subset=[name], na_rep="–")
+    style.map(_shade, subset=[name for name in frame if formats.get(name) in (percent, _share)])
+    style.bar(subset=[name for name in bars if frame[name].max() > 0], color="#14629f40", vmin=0)
+    texts = frame.select_dtypes(exclude="number").astype(str)
+    long = [name for name in texts if texts[name].str.len().max() > LONG]
+    style.set_table_styles({name: [{"selector": "", "props": "text-align: left"}] for name in texts})
+    style.set_td_classes(pd.DataFrame("long", frame.index, long))
+    style.format_index(escape, axis="index").format_index(escape, axis="columns")
+    style.set_caption(Markup("<span>{}</span>").format(caption))
+    if frame.columns.name:
+        style.set_table_attributes('class="matrix"')
+    else:
+        style.hide(axis="index")
+    html = re.sub(r'class="(col|row)_heading', r'scope="\1" class="\1_heading', style.to_html())  # for screen readers
+    region = Markup('<div class="scroll" role="region" tabindex="0" aria-label="{}">{}</div>')
+    return region.format(caption, Markup(html))
+
+
+def _shade(share: float) -> str:
+    if math.isnan(share):
+        return ""
+    return f"background: rgb(20 98 159 / {90 * share:.0f}%)" + ("; color: #fff" if share > 0.6 else "")
+
+
+def _matrix(table: pd.DataFrame, column: str, title: str, write: Write = percent) -> Markup:
+    """Return a table of map devices (rows) by query devices (columns)."""
+    values = table.set_index(["map_device", "query_device"])[column].unstack().rename_axis(columns="map \\ query")
+    values = values.loc[table["map_device"].unique(), table["query_device"].unique()].rename_axis(index=None)
+    return _table(values, title, dict.fromkeys(values, write))
+
+
+def _scores(table: pd.DataFrame, caption: str, thresholds: list[str]) -> Markup:
+    """Return a table with columns of recall and median errors."""
+    small, factor = small_unit(unit_of(*thresholds))
+    shares = {name: f"recall {threshold_text(name)}" for name in thresholds} | {"ok_wrong": "ok but wrong"}
+    names = {"map_device": "map", "query_device": "query", "low_confidence": "low confidence", "state": "note"}
+    names |= {"median_rotation_deg": "median [°]", "median_translation_m": f"median [{small}]", **shares}
+    formats: dict[str, Write] = {"median [°]": number, f"median [{small}]": lambda length: number(factor * length)}
+    return _table(table.rename(columns=names), caption, formats | dict.fromkeys(shares.values(), _share))
+
+
+def _pairs(recall: pd.DataFrame, thresholds: list[str]) -> Markup:
+    columns = ["map_device", "query_device", "queries", "localized", "ok", "low_confidence", "failed", *thresholds]
+    columns += ["median_rotation_deg", "median_translation_m", "ok_wrong", "state"]
+    shown = recall[[name for name in columns if name in recall]].replace({"state": {"evaluated": ""}})
+    return _scores(shown, "Counts of queries, recall and median errors of every pair", thresholds)
+
+
+def _steps(sequences: pd.DataFrame, thresholds: list[str]) -> Markup:
+    """List recall and median errors after each step of the sequence stage, over all pairs."""
+    if not len(sequences):
+        return Markup()
+    medians = dict.fromkeys(["median_rotation_deg", "median_translation_m"], "median")
+    over_pairs = {"queries": "sum", **dict.fromkeys(thresholds, "mean"), **medians, **dict.fromkeys(CHANGES, "sum")}
+    caption = "Queries after each step of the sequence stage: mean recall and median error of the pairs"
+    return _scores(sequences.groupby("step", sort=False).agg(over_pairs).reset_index(), caption, thresholds)
+
+
+def _changes(changes: pd.DataFrame, unit: str) -> Markup:
+    """List queries that the sequence stage broke or rescued."""
+    if not len(changes):
+        return Markup()
+    shown = changes.sort_values("change", kind="stable")[:WORST]
+    off = {of: [off_by(row, of, unit=unit) for row in shown.to_dict("records")] for of in ("single_", "")}
+    columns = {"query": _queries(shown), "change": shown["change"], "single": off["single_"], "sequence": off[""]}
+    table = pd.DataFrame({**columns, "device": shown["device_id"], "timestamp [µs]": shown["timestamp"]})
+    counts = changes["change"].value_counts()
+    caption = ", ".join(f"{counts.get(name, 0)} {name}" for name in CHANGES)
+    return _table(table, f"Queries within the last threshold only with or only without their sequence: {caption}")
+
+
+def _losses(losses: pd.DataFrame) -> Markup:
+    """List the losses by reason: the sum over the pairs of each map device, and over all pairs."""
+    if "threshold" not in losses or losses["threshold"].isna().all():
+        return Markup()
+    sums = {
+        threshold_text(str(threshold)): pd.concat([pairs, pairs.assign(map_device="all")])
+        .groupby("map_device", sort=False)[["queries", "missed", *REASONS]]
+        .sum()
+        for threshold, pairs in losses.groupby("threshold", sort=False)
+    }
+    table = pd.concat(sums, names=["threshold", "map"]).reset_index()
+    table[[*REASONS]] = table[[*REASONS]].div(table["queries"], axis="index")
+    caption = "Queries missed at each threshold, and the share of all queries lost for each reason"
+    return _table(table, caption, dict.fromkeys(REASONS, _share))
+
+
+def _failures(statuses: pd.DataFrame) -> Markup:
+    """Count the queries without a pose by reason."""
+    failed = statuses[statuses["status"].str.startswith("failed")] if len(statuses) else statuses
+    if not len(failed):
+        return Markup()
+    # Drop details in parentheses: they differ from query to query for the same reason.
+    reasons = failed["status"].str.removeprefix("failed").str.replace(r" \(.*", "", regex=True).str.lstrip(": ")
+    groups = _queries(failed).groupby(reasons.rename("reason"))
+    where = groups.agg(lambda pairs: ", ".join(f"{pair} {count}" for pair, count in pairs.value_counts().items()))
+    table = pd.DataFrame({"queries": groups.size(), "where": where})
+    table = table.sort_values("queries", ascending=False, kind="stable")
+    caption = "Queries without a pose, by reason"
+    if rest := table["queries"][MOST_REASONS:].sum():
+        caption += f"; {rest} more have other reasons"
+    return _table(table[:MOST_REASONS].reset_index(), caption)
+
+
+def _wrong_ok(errors: pd.DataFrame, unit: str) -> Markup:
+    """List the poses that are called ok but are wrong, the largest errors first."""
+    if not len(errors):
+        return Markup()
+    called_ok = errors[errors["status"] == "ok"]
+    turned, moved = called_ok[["rotation_error_deg", "translation_error_m"]].to_numpy(float).T
+    wrong = called_ok[~is_below(turned, moved, WRONG)].sort_values("translation_error_m", ascending=False)
+    limit = f"{WRONG[0]:g}°, {WRONG[1]:g} {unit}"
+    caption = f"{len(wrong)} of {len(called_ok)} poses that are called ok are wrong: beyond {limit}."
+    if len(wrong) > WORST:
+        caption += f" These are the {WORST} worst; evaluation/errors.csv has all."
+    return _listed(wrong[:WORST], caption, unit)
+
+
+def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Markup:
+    """List the queries with the largest errors or, without ground truth, with the least support."""
+    if not len(queries):
+        return Markup()
+    threshold = parse_threshold(thresholds[0]) if thresholds else THRESHOLDS[0]
+    unit = unit_of(*thresholds)
+    worst = queries.iloc[worst_first(queries, threshold)[:WORST]]
+    caption = f"The {len(worst)} least supported; there is no ground truth to compare with"
+    if "rotation_error_deg" in queries:
+        caption = f"The {len(worst)} worst, by the larger of rotation error / {threshold[0]:g}° and "
+        caption += f"translation error / {threshold[1]:g} {unit}"
+    return _listed(worst, caption, unit)
+
+
+def _listed(queries: pd.DataFrame, caption: str, unit: str) -> Markup:
+    """Return a table with a row for each query."""
+    table, names = pd.DataFrame({"query": _queries(queries)}), {"reason": "why"}
+    if "rotation_error_deg" in queries:
+        rows, names = queries.to_dict("records"), {}
+        table["off by"] = [off_by(row, unit=unit) for row in rows]
+        table["why"] = [_why(row) for row in rows]
+    table["status"], table["inliers"] = queries["status"].str.replace("_", " "), queries["num_inliers"]
+    names |= {"p_correct": "stated to be right", "rival_support": "support of a rival"}
+    if "image" in queries and queries["image"].notna().all():
+        table["image"] = queries["image"].map(_shown_names)
+    else:  # tables of earlier versions have no names
+        names |= {"device_id": "device", "timestamp": "timestamp [µs]"}
+    known = queries.filter([*names]).dropna(axis="columns", how="all").rename(columns=names)
+    formats = {"stated to be right": "{:.1%}".format, "support of a rival": "{:.0%}".format}
+    return _table(table.join(known), caption, formats)
+
+
+def _queries(table: pd.DataFrame) -> "pd.Series[str]":
+    return table["query_device"] + " in " + table["map_device"] + " map"
+
+
+def _shown_names(images: str) -> str:
+    """Return the name of a query's first image, and how many more there are."""
+    first, *more = images.split(";")
+    return first + (f" and {len(more)} more" if more else "")
+
+
+def _why(row: dict[str, Any]) -> str:
+    """Return the reason of the loss at the widest threshold that a query misses."""
+    losses = {name: reason for name, reason in row.items() if name.startswith("loss@")}
+    missed = [f"{reason} at {threshold_text(name)}" for name, reason in losses.items() if reason in REASONS]
+    return missed[-1] if missed else "within every threshold" if losses else ""
+
+
+def _retrieval(retrieval: pd.DataFrame, headlines: list[tuple[str, str]], unit: str) -> tuple[list[Markup], str]:
+    ks = [column for column in retrieval.columns if column.startswith("recall@")]
+    done = retrieval.dropna(subset=ks) if ks else retrieval.iloc[:0]
+    if not len(done):
+        return [], ""
+    titles = {k: f"In the first {k.removeprefix('recall@')} [%]" for k in ks}
+    titles["in_map"] = "Anywhere in the map [%]"
+    matrices = [_matrix(retrieval, column, titles[column]) for column in titles if column in done]
+    first = ks[-1].removeprefix("recall@")
+    headlines.append((f"{percent(done[ks[-1]].mean())} %", f"have a good reference in the first {first}"))
+    reach = f"{done['radius_m'].iloc[0]:g} {unit}"
+    note = f"A good reference stands within {reach} of the query's true camera and looks the "
+    return matrices, f"{note}same way to within {done['angle_deg'].iloc[0]:g}°."
+
+
+def _links(files: SceneFiles, older: Collection[str]) -> dict[str, Markup]:
+    """Link the files of a scene, except for those named `older`, by what they are."""
+    found = {
+        kind: [_anchor(path.name, files.run, path) for path in sorted(files.root.glob(name)) if path.name not in older]
+        for kind, name in LINKED.items()
+    }
+    return {kind: Markup(" ").join(links) for kind, links in found.items() if links}
+
+
+# Text
+
+
+def _link(run_dir: Path, path: Path) -> str:
+    """Return the URL of a file, relative to the page."""
+    return quote(path.relative_to(run_dir).as_posix())
+
+
+def _anchor(text: str, run_dir: Path, path: Path) -> str:
+    """Return a link to a file as HTML; only the text if there is no such file."""
+    return Markup('<a href="{}">{}</a>').format(_link(run_dir, path), text) if path.is_file() else text
+
+
+def _natural(path: Path) -> list[Any]:
+    """Natural sort key: 10 comes after 9."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
+
+
+def _share(share: float) -> str:
+    return f"{percent(share)} %"
+
+
+def _length(length: float, unit: str) -> str:
+    if unit == "m" and length < 1:
+        return f"{number(100 * length)} cm"
+    return f"{number(length)} {unit}" if length < math.inf else "∞"
+
+
+def off_by(row: Mapping[Any, Any], before: str = "", after: str = "", *, unit: str) -> str:
+    """Return the errors of a query as text; `before` and `after` complete the names of their columns."""
+    angle, length = (row[f"{before}{name}{after}"] for name in ("rotation_error_deg", "translation_error_m"))
+    return f"{number(angle)}°, {_length(length, unit)}" if math.isfinite(angle) else "no pose"
+
+
+def seconds_text(seconds: float | None) -> str:
+    if seconds is None or math.isnan(seconds):
+        return "–"
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    return f"{int(seconds) // 60} min {int(seconds) % 60} s"
+
+
+def threshold_text(name: str) -> str:
+    degrees, meters = parse_threshold(name)
+    return f"{degrees:g}°, {meters:g}\N{NO-BREAK SPACE}{unit_of(name)}"
+
+
+class Album:
+    """Turns picture files into data URLs until `room` bytes are used up."""
+
+    def __init__(self, run_dir: Path, room: int, left_out: list[str]) -> None:
+        self.run_dir = run_dir
+        self.left_out = left_out
+        self._room = room
+
+    def picture(self, path: Path, title: str = "", caption: str = "") -> Picture:
+        """Return a picture for the page; without a `title`, it has the one in the file."""
+        from PIL import Image
+
+        name, link = str(path.relative_to(self.run_dir)), _link(self.run_dir, path)
+        try:
+            with Image.open(path) as image:
+                info = getattr(image, "text", {})
+                title = title or info.get("Title") or info.get("Description") or path.stem.replace("_", " ")
+                wide = image.width > 1.8 * image.height
+                data, kind = path.read_bytes(), "png"
+                if image.width > MAX_WIDTH or len(data) > 150_000:
+                    small = as_jpeg(image, MAX_WIDTH)
+                    if len(small) < len(data):  # plots are often smaller as PNG
+                        data, kind = small, "jpeg"
+        except (OSError, ValueError, SyntaxError) as error:  # Pillow raises the latter two for some torn PNGs
+            return Picture("", f"{name} cannot be read: {error}", "", link)
+        if len(data) > self._room:
+            self.left_out.append(name)
+            return Picture("", title, caption, link)
+        self._room -= len(data)
+        return Picture(f"data:image/{kind};base64,{base64.b64encode(data).decode()}", title, caption, link, wide)

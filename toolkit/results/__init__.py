@@ -1,0 +1,1 @@
+"""Results of the localize stage: the one reader, errors, recall."""

@@ -1,1 +1,0 @@
-"""Recordings for the rerun viewer, still pictures, figures and the report."""

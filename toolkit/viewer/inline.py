@@ -1,0 +1,82 @@
+"""Show pictures and recordings in a notebook; the viewer only in an interactive session."""
+
+import html
+import io
+import os
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from toolkit.errors import ArtifactError
+from toolkit.figures.png import as_jpeg
+from toolkit.runs.kernel import TEXT_BARS
+from toolkit.viewer.blueprint import open_command
+
+ASSETS = "RERUN_NOTEBOOK_ASSET"
+"""Environment variable that tells rerun_notebook where to load the viewer from; read on import."""
+MAX_INLINE_BYTES = 200_000_000
+"""Size of a recording up to which the notebook shows it."""
+MAX_WIDTH = 1400
+"""Width of a JPEG, pixels, at most."""
+
+
+def show_picture(path: str | Path) -> Any:
+    """Return a picture for a notebook: the file as it is, or reduced as a JPEG if that is smaller.
+
+    Raises:
+        ArtifactError: the picture is missing or cannot be read.
+    """
+    import PIL.Image
+    from IPython.display import Image
+
+    try:
+        with PIL.Image.open(path) as picture:
+            small = as_jpeg(picture, MAX_WIDTH)
+        return Image(data=min(Path(path).read_bytes(), small, key=len))
+    except (OSError, SyntaxError, ValueError) as error:
+        raise ArtifactError(f"{path}: cannot read the picture ({error}). Run the cells above again.") from None
+
+
+def show_recording(path: str | Path, height: int = 600) -> Any:
+    """Show a recording in a notebook: a link, the command that opens it, and the viewer itself.
+
+    This process serves the viewer, so it needs no network. There is no viewer when the pipeline runs the notebook,
+    because saved pages do not store its content.
+
+    Args:
+        height: height of the viewer, pixels.
+
+    Returns:
+        The viewer's widget; None without a viewer.
+
+    Raises:
+        ArtifactError: the recording is missing.
+    """
+    from IPython.display import HTML, display
+
+    path = Path(path)
+    if not path.is_file():
+        raise ArtifactError(f"{path}: no such recording. Run the cells above with recordings = True.")
+    # Relative to the notebook, so that the run folder can be moved.
+    link = quote(os.path.relpath(path.resolve(), Path.cwd()))
+    size_mb = path.stat().st_size / 1e6
+    display(
+        HTML(
+            f'<p>Recording: <a href="{link}" download>{html.escape(path.name)}</a> ({size_mb:.1f} MB). '
+            f"Open it in the project's environment with<br><code>{html.escape(open_command(path.resolve()))}</code></p>"
+        )
+    )
+    if TEXT_BARS in os.environ:
+        return None
+    if path.stat().st_size > MAX_INLINE_BYTES:
+        display(HTML("<p>It is too large to show here; use the command.</p>"))
+        return None
+    os.environ.setdefault(ASSETS, "serve-local")
+    with redirect_stdout(io.StringIO()):  # hide the address that it prints
+        import rerun_notebook
+
+    viewer = rerun_notebook.Viewer(width="auto", height=height)
+    viewer.send_rrd(path.read_bytes())
+    display(viewer)
+    return viewer
