@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.devices import in_order
-from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError, CaptureError, ToolkitError
 from toolkit.figures.evaluation import Evaluation, draw_evaluation
 from toolkit.figures.sequences import SequencePair
@@ -31,6 +30,7 @@ from toolkit.files import (
 )
 from toolkit.geometry import Floats
 from toolkit.manifest import EvaluateSettings
+from toolkit.pose.result import Status, status_counts, statuses
 from toolkit.results.metrics import (
     NO_POSE,
     NO_REFERENCE,
@@ -50,7 +50,7 @@ from toolkit.results.metrics import (
     unit_of,
 )
 from toolkit.results.overlap import LEAST_OVERLAP, overlap_in_view, seen_by
-from toolkit.results.pair import load_maps, map_files
+from toolkit.results.pair import PairResults, load_maps, map_files
 from toolkit.runs.pairs import LEFT_OUT, left_out
 
 if TYPE_CHECKING:
@@ -166,7 +166,7 @@ def evaluate_scene(
                 rows["retrieval"].append({**pair, **row})
                 if good is None:
                     messages.append(f"{name}: {row['state']}, so no miss is attributed to retrieval.")
-            results, state = _read_results(Path(poses_dir) / name, keys)
+            results, state = _read_results(Path(poses_dir) / f"{name}.txt", keys)
             if results is None:
                 messages.append(f"{name}: {state}; its queries are not counted.")
                 for kind in ("recall", "losses"):
@@ -303,13 +303,12 @@ def _query_tables(poses_dir: str | Path, scene: str, map_devices: Sequence[str],
     tables = []
     for map_ in map_devices:
         with suppress(ArtifactError):  # `_read_results` reports it
-            tables.append(read_query_table(Path(poses_dir) / f"{pair_name(scene, map_, query)}.csv", ["status"]))
+            tables.append(PairResults.of(poses_dir, scene, map_, query).table)
     return tables
 
 
-def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, str]:
+def _read_results(path: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, str]:
     """Return `keys` with the columns pose (4, 4), status and `DETAILS` (None without poses), and the pair's state."""
-    path, table = stem.with_name(f"{stem.name}.txt"), stem.with_name(f"{stem.name}.csv")
     if not path.is_file():
         return None, "no poses file"
     try:
@@ -320,15 +319,14 @@ def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
     except CaptureError as error:
         return None, f"unreadable poses file ({error})"
     located = is_posed(poses)
-    # Another tool writes only poses; then every pose counts as ok.
-    status = np.where(located, "ok", "failed: no pose")
+    status = np.where(located, Status.OK, Status.FAILED).astype(object)
     results = keys.assign(pose=list(poses), status=status, **dict.fromkeys(DETAILS, np.nan))
+    table = path.with_suffix(".csv")
+    if not table.is_file():  # another tool writes only poses; then every pose counts as ok
+        return results, "evaluated"
     columns = ["timestamp", "device_id"]
     try:
-        require_whole(table, of=path)
-        if not table.is_file():
-            return results, "evaluated"
-        details = read_query_table(table, ["status"]).drop_duplicates(columns)
+        details = PairResults.open(path).table.drop_duplicates(columns)
     except ArtifactError as error:
         return results, f"unreadable table of queries ({error})"
     details = keys.merge(details, how="left", on=columns)
@@ -339,7 +337,7 @@ def _read_results(stem: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
     num_rows = int(details["status"].notna().sum())
     if num_rows < len(keys):
         return results, f"stale: {num_rows} of {len(keys)} queries have a row in {table.name}"
-    if np.any(results["status"].str.startswith("failed").to_numpy(bool) == located):
+    if np.any((statuses(results["status"]) == Status.FAILED).to_numpy(bool) == located):
         return results, f"stale: {table.name} and {path.name} differ in which queries have a pose"
     return results, "evaluated"
 
@@ -390,13 +388,13 @@ def _errors_of(
 def _summary(frame: pd.DataFrame, thresholds: Sequence[Threshold], unit: str) -> dict[str, Any]:
     """Return a pair's row of the table `recall`."""
     rotation_deg, translation_m = (frame[name].to_numpy(float) for name in ERROR_COLUMNS[-2:])
-    status = frame["status"].str.split(":").str[0]
+    status = statuses(frame["status"])
     shares = recall(rotation_deg, translation_m, thresholds)
-    wrong = (status == "ok") & ~is_below(rotation_deg, translation_m, WRONG)
+    wrong = (status == Status.OK) & ~is_below(rotation_deg, translation_m, WRONG)
     return {
         "queries": len(frame),
         "localized": int(np.isfinite(rotation_deg).sum()),
-        **{name: int((status == name).sum()) for name in ("ok", "low_confidence", "failed")},
+        **status_counts(frame["status"]),
         **{f"recall@{threshold_name(t, unit)}": share for t, share in zip(thresholds, shares, strict=True)},
         "median_rotation_deg": float(np.median(rotation_deg)),
         "median_translation_m": float(np.median(translation_m)),

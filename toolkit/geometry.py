@@ -118,6 +118,11 @@ def shifted(a_from_b: ArrayLike, offset: ArrayLike) -> Floats:
     return poses
 
 
+def scaled(poses: Floats, factor: float) -> Floats:
+    """Return poses (..., 4, 4) with their translations multiplied by a factor."""
+    return make_pose(poses[..., :3, :3], factor * poses[..., :3, 3])
+
+
 def invert(a_from_b: ArrayLike) -> Floats:
     """Return b_from_a, (..., 4, 4), of rigid poses a_from_b, (..., 4, 4)."""
     pose = np.asarray(a_from_b, np.float64)

@@ -4,8 +4,8 @@ import json
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,14 +14,13 @@ import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
 
-from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.capture.tables import in_unit_of_poses, read_query_table
 from toolkit.capture.upright import Turns, upright_turns
-from toolkit.errors import INTERNAL, ToolkitError, reason_of
+from toolkit.errors import ToolkitError, reason_of
 from toolkit.features.matching import AnyMethod, MutualMatcher, resolve_auto, weights_files
-from toolkit.features.stores import FeatureStore, MatchStore, extract_session, match_sessions
+from toolkit.features.stores import FeatureStore, extract_session, match_sessions
 from toolkit.files import (
     Remade,
     file_fingerprint,
@@ -38,35 +37,21 @@ from toolkit.files import (
     write_sidecar,
     write_text,
 )
+from toolkit.geometry import Floats, qt_from_pose
 from toolkit.manifest import LocalizeSettings
 from toolkit.mapping.build import map_settings
-from toolkit.pose.base import (
-    Localizer,
-    PoseEstimate,
-    Query,
-    References,
-    ScaledLocalizer,
-)
-from toolkit.pose.correspondences import MAPS, LocalizedQuery, query_group
-from toolkit.pose.escalation import EscalatingLocalizer, can_gain, is_better, is_sure, known_poses
+from toolkit.pose.base import Query, QueryInput, References
 from toolkit.pose.intrinsics_check import MAX_SHARES, SIGNIFICANCE
 from toolkit.pose.pnp import PNP_FORMAT
-from toolkit.pose.stored_queries import localized_query, references_of_images, stored_query
+from toolkit.pose.result import QueryResult, status_counts
 from toolkit.prediction.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.prediction.registry import open_predictor
 from toolkit.results.metrics import camera_messages
+from toolkit.results.pair import query_group
 from toolkit.runs.pairs import PairRows
-from toolkit.scene.locate import localize_image
-from toolkit.scene.map import (
-    Map,
-    attributes,
-    create_localizer,
-    create_methods,
-    label,
-    needs_upright,
-    session_fingerprint,
-    update_attributes,
-)
+from toolkit.scene.map import WITHOUT_FEATURES, Map, create_methods, localize_image, needs_upright
+from toolkit.scene.opening import MAPS, attributes, session_fingerprint, update_attributes
+from toolkit.scene.stored import StoredQueries
 from toolkit.store.hdf5 import write_groups
 from toolkit.store.items import Items, heals
 from toolkit.threads import fixed_sums
@@ -83,7 +68,7 @@ COLUMNS = [
 PREDICTION_COLUMNS = ["scale_std", "rejected"]
 """Additional columns of `feed_forward` and `hybrid`."""
 
-ESCALATION_COLUMNS = ["first_status", "first_seconds"]
+FALLBACK_COLUMNS = ["first_status", "first_seconds"]
 """Additional columns if `features.escalation` is set: status and seconds before the escalation features were used;
 empty for a query that did not need them."""
 
@@ -155,8 +140,8 @@ def localize_pairs(
                     localized = run.localize(record, h5_attributes)
                     write_text(pair.map_record, json.dumps(run.map.record(), indent=1) + "\n")
                     write_sidecar(pair.map_record, stage.made_from(h5_attributes))
-                    _write_poses(pair, localized, settings)
-                    unfinished = any(map(_is_internal, localized))
+                    localized.write(pair, settings)
+                    unfinished = localized.unfinished
                 if update_attributes(pair.file("h5"), h5_attributes) or not skipped:
                     maps = [stage.folders.map / name for name in json.loads(h5_attributes[MAPS])]
                     write_sidecar(
@@ -166,11 +151,11 @@ def localize_pairs(
                     )
                 rows = read_query_table(pair.file("csv"), ["status"])
                 query_tables.setdefault(queried, []).append(rows)
-                counts = rows["status"].str.split(":").str[0].value_counts()
+                counts = status_counts(rows["status"])
                 of_map = read_map_record(pair.map_record)
                 row |= {
-                    "queries": int(counts.sum()),
-                    **{status: int(counts.get(status, 0)) for status in ("ok", "low_confidence", "failed")},
+                    "queries": len(rows),
+                    **counts,
                     "escalated": int(rows["first_status"].notna().sum()) if settings.features.escalation else 0,
                     "map_poses": "inconsistent" if of_map["camera"] else of_map["verdict"],
                     "seconds": round(time.perf_counter() - started, 2),
@@ -318,17 +303,16 @@ class _Stage(Remade):
         maps = [self.folders.map / name for name in json.loads(h5_attributes[MAPS])]
         return {"unit": self.settings.unit, "maps": [read_sidecar(path) for path in maps]}
 
-    def _open_map(self, device: str) -> tuple[Map, Localizer]:
+    def _open_map(self, device: str) -> Map:
         folders = self.folders
-        map_ = Map.build(
+        return Map.build(
             self.capture, device, self.settings, self.kinds, folders.features, folders.map, self.workers,
-            self.skip_existing, self.escalation,
+            self.skip_existing, self.escalation, self.predictor,
         )  # fmt: skip
-        return map_, create_localizer(self.settings, map_, self.predictor)
 
     def run(self, map_device: str, query_device: str) -> "_PairRun":
         """Open the map of a pair and the features of its queries."""
-        return _PairRun(_Pair(self, map_device, query_device), *self.open_map(map_device))
+        return _PairRun(_Pair(self, map_device, query_device), self.open_map(map_device))
 
     @property
     def networks(self) -> dict[str, Any]:
@@ -342,37 +326,28 @@ class _Stage(Remade):
         return _Stage.elsewhere(self.folders, self.settings, self.queries, True, 0, time.time_ns(), self.networks)
 
 
-_Task = tuple[int, Query, list[References], Any, float]
-"""Number of a query, the query, its references, the prediction of a network, and the seconds which that took."""
 _Todo = tuple[str, str, int]
 """Name of a query's item, fingerprint of its sources, and number of the query."""
-_ToEscalate = tuple[str, str, int, dict[str, Any]]
-"""Name of the item of an escalated query, fingerprint of its sources, number of the query, and its first table row."""
-_Faulty = dict[int, tuple[dict[str, Any], LocalizedQuery]]
-"""Number of a query that failed with an internal error -> its row and correspondences. It gets no item, so the next run
-tries it again."""
-_ESCALATED = "/escalated"
-"""Ends the name of a query's item with the escalation features. It has no arrays if the first correspondences count."""
+_Task = tuple[int, QueryInput, Any, float]
+"""Number of a query, the query, what is known of it (a prediction, or its first result), and seconds spent on it."""
+_Results = dict[int, QueryResult]
+"""Queries that failed with an internal error, by number. They get no item, so the next run tries them again."""
+_RETRIED = "/retried"
+"""Ends the name of a query's item with the fallback features. It has no arrays if the first correspondences count."""
 
 
 class _PairRun:
     """Localizes the queries of one pair."""
 
-    def __init__(self, pair: _Pair, map_: Map, localizer: Localizer) -> None:
-        self.pair, self.map, self.localizer, self.stage = pair, map_, localizer, pair.stage
-        self.first = localizer.first if isinstance(localizer, EscalatingLocalizer) else localizer
-        """The localizer without escalation features."""
+    def __init__(self, pair: _Pair, scene_map: Map) -> None:
+        self.pair, self.map, self.stage = pair, scene_map, pair.stage
         keyframes = pair.keyframes
         self.keys = list(zip(keyframes["timestamp"].tolist(), keyframes["device_id"].tolist(), strict=True))
         self.rows = pair.session.rows_of_keyframes(keyframes)
         """For each query, the rows of its images."""
-        index_of = {name: index for index, name in enumerate(localizer.image_names)}
-        self.references = references_of_images(pair.retrieval, index_of)
-        """References of each query image, by timestamp and sensor."""
-        self.stores: list[FeatureStore] = []
-        self.matches: list[MatchStore | None] = []
-        if map_.settings.method != "feed_forward":
-            for kind in map_.kinds:
+        self.stored = StoredQueries(pair.session, pair.retrieval)
+        if scene_map.settings.method not in WITHOUT_FEATURES:
+            for kind in scene_map.kinds:
                 self._add_kind(kind, range(len(self.keys)))
 
     def _add_kind(self, kind: AnyMethod, numbers: Sequence[int]) -> None:
@@ -380,69 +355,66 @@ class _PairRun:
 
         If the map has no features of this kind, also extract those of the references.
         """
-        session, map_, stage = self.pair.session, self.map, self.stage
+        session, scene_map, stage = self.pair.session, self.map, self.stage
         rows = np.unique(np.concatenate([*(self.rows[number] for number in numbers), np.zeros(0, np.int64)]))
-        turns = map_.turns_of(kind, session)
+        turns = scene_map.turns_of(kind, session)
         store = extract_session(session, stage.folders.features, kind.extractor, rows, stage.workers, turns=turns)
         images = session.images.iloc[rows]
         keys = zip(images["timestamp"].tolist(), images["sensor_id"].tolist(), strict=True)
         names = [
-            (session.image_name(int(row)), self.localizer.image_names[index])
+            (session.image_name(int(row)), name)
             for row, key in zip(rows, keys, strict=True)
-            if key in self.references
-            for index in self.references[key].images
+            for name, _ in self.stored.references.get(key, [])
+            if name in scene_map.index_of
         ]
-        map_features = next((mapped.features for mapped in map_.mapped if mapped.name == kind.name), None)
+        map_features = next((mapped.features for mapped in scene_map.mapped if mapped.name == kind.name), None)
         if map_features is None:
             references = dict.fromkeys(name for _, name in names)
-            map_features = map_.on_demand(kind).prepare(references, stage.workers, stage.skip_existing)
+            map_features = scene_map.on_demand(kind).prepare(references, stage.workers, stage.skip_existing)
         matches = None
         if isinstance(map_features, FeatureStore) and not isinstance(kind.matcher, MutualMatcher):
-            sessions = session.id, f"{map_.device}_map"
+            sessions = session.id, f"{scene_map.device}_map"
             stores = store, map_features
-            matches = match_sessions(stores, names, kind.matcher, map_.map_dir, sessions, stage.skip_existing)
-        self.stores.append(store)
-        self.matches.append(matches)
+            matches = match_sessions(stores, names, kind.matcher, scene_map.map_dir, sessions, stage.skip_existing)
+        self.stored.stores.append(store)
+        self.stored.matches.append(matches)
 
-    def query(self, number: int) -> tuple[Query, list[References]]:
-        # Local features were extracted from upright images: only a predictor still needs the turns.
-        turns = self.map.turns if self.map.settings.predicts else None
-        rows = self.rows[number]
-        return stored_query(self.pair.session, rows, self.references, self.stores, self.matches, turns)
+    def query(self, number: int) -> QueryInput:
+        return self.stored.query(self.map, self.rows[number])
 
-    def localize(self, record: dict[str, Any], h5_attributes: Mapping[str, str]) -> list[dict[str, Any]]:
-        """Localize the queries that are not localized yet, and write the `.h5` file.
-
-        Returns:
-            A row per query, in the keyframe list's order.
-        """
+    def localize(self, record: dict[str, Any], h5_attributes: Mapping[str, str]) -> "_Localized":
+        """Localize the queries that are not localized yet, and write the `.h5` file."""
         names, source = [query_group(*key) for key in self.keys], fingerprint(record)
         numbers = {name: number for number, name in enumerate(names)}  # a keyframe list may repeat a query
         with Items(self.pair.file("items"), again=not self.stage.skip_existing) as items:
             items.drop_damaged()
             todo = items.spread(
                 _localize_share, items.left((name, source, number) for name, number in numbers.items()),
-                (self.stage.of_worker, *self.devices), self._label, "query", self.first.batch_size,
+                (self.stage.of_worker, *self.devices), self._label, "query", self.map.localizer.batch_size,
             )  # fmt: skip
             faulty = self.localize_into(items, todo)
-            if isinstance(self.localizer, EscalatingLocalizer):
+            if self.map.fallback is not None:
                 items.flush()
                 localized = [(name, source, number) for name, number in numbers.items() if number not in faulty]
-                faulty |= self._escalate(items, localized)
-        last = {name: name + _ESCALATED * items.is_current(name + _ESCALATED, source) for name in numbers}
+                faulty |= self._retry(items, localized)
+        last = {name: name + _RETRIED * items.is_current(name + _RETRIED, source) for name in numbers}
         # If the run is killed before it writes the new poses, no poses of an earlier run may lie beside this file.
         for poses in (self.pair.file("txt"), sidecar_path(self.pair.file("txt"))):
             poses.unlink(missing_ok=True)
-        groups = (
-            (name, faulty[number][1].arrays() if number in faulty else items[last[name]] or items[name])
-            for name, number in numbers.items()
-        )
-        write_groups(self.pair.file("h5"), groups, h5_attributes)
-        images = self.pair.session.own_names(self.rows)
-        rows = {
-            name: faulty[number][0] if number in faulty else items.note(last[name]) for name, number in numbers.items()
-        }
-        return [rows[name] | {"image": image} for name, image in zip(names, images, strict=True)]
+        collected = _Localized(dict(zip(names, self.pair.session.own_names(self.rows), strict=True)), names)
+
+        def groups() -> Iterator[tuple[str, dict[str, Any]]]:
+            for name, number in numbers.items():
+                if number in faulty:
+                    row, arrays = faulty[number].to_row(*self.keys[number]), faulty[number].arrays()
+                    collected.unfinished = True
+                else:
+                    row, arrays = items.note(last[name]), items[last[name]] or items[name]
+                collected.add(name, row, arrays)
+                yield name, arrays
+
+        write_groups(self.pair.file("h5"), groups(), h5_attributes)
+        return collected
 
     @property
     def devices(self) -> tuple[str, str]:
@@ -453,44 +425,45 @@ class _PairRun:
     def _label(self) -> str:
         return f"localize {self.pair.query_device} in {self.pair.map_device}"
 
-    def localize_into(self, items: Items, todo: Sequence[_Todo]) -> _Faulty:
+    def localize_into(self, items: Items, todo: Sequence[_Todo]) -> _Results:
         """Localize queries and add them as items; return those that failed with an internal error."""
-        faulty: _Faulty = {}
+        faulty: _Results = {}
         of_number = {number: (name, source) for name, source, number in todo}
-        tasks = self._predicted(self.first, list(of_number))
-        for number, row, localized in self._localized(self.first.localize, tasks, len(todo)):
-            if _is_internal(row):
-                faulty[number] = row, localized
+        for number, result in self._run(self._locate, self._predicted(list(of_number)), len(todo)):
+            if result.is_internal:
+                faulty[number] = result
             else:
-                items.add(*of_number[number], localized.arrays(), row)
+                items.add(*of_number[number], result.arrays(), result.to_row(*self.keys[number]))
         return faulty
 
-    def _escalate(self, items: Items, localized: Sequence[_Todo]) -> _Faulty:
-        """Localize queries without a sure pose again, with the escalation features; returns as `localize_into`."""
-        limit = self.map.sure_position_std
-        rows = {number: items.note(name) for name, _, number in localized}
-        escalated = [(name + _ESCALATED, source, number) for name, source, number in localized]
+    def _retry(self, items: Items, localized: Sequence[_Todo]) -> _Results:
+        """Retry unsure queries with the fallback features; return as `localize_into`."""
+        retried = [(name + _RETRIED, source, number) for name, source, number in localized]
         todo = [
-            (name, source, number, row)
-            for name, source, number in items.left(escalated)
-            if not ((row := rows[number])["misfit"] or is_sure(row["status"], row["position_std_m"], limit))
-            and can_gain(*self.query(number))
+            one
+            for one in items.left(retried)
+            if self.map.needs_fallback(*self.query(one[2]), self._first(items, one))
         ]
         if not todo:
             return {}
         started = time.perf_counter()
-        self.add_escalation(todo)
+        self.add_fallback(todo)
         shared = (time.perf_counter() - started) / len(todo)
-        todo = items.spread(_escalate_share, todo, (self.stage.of_worker, *self.devices, shared), self._label, "query")
-        return self.escalate_into(items, todo, shared)
+        todo = items.spread(_retry_share, todo, (self.stage.of_worker, *self.devices, shared), self._label, "query")
+        return self.retry_into(items, todo, shared)
 
-    def add_escalation(self, todo: Sequence[_ToEscalate]) -> None:
-        """Extract and match the escalation features of queries."""
+    def _first(self, items: Items, todo: _Todo) -> QueryResult:
+        """Return the stored result of a query from the features that every query has."""
+        name = todo[0].removesuffix(_RETRIED)
+        return QueryResult.from_arrays(items[name]).with_row(items.note(name))
+
+    def add_fallback(self, todo: Sequence[_Todo]) -> None:
+        """Extract and match the fallback features of queries."""
         for kind in self.map.escalation:
-            self._add_kind(kind, [number for _, _, number, _ in todo])
+            self._add_kind(kind, [number for _, _, number in todo])
 
-    def escalate_into(self, items: Items, todo: Sequence[_ToEscalate], shared: float) -> _Faulty:
-        """Localize queries again with the escalation features, which are extracted; add them, if better, as items.
+    def retry_into(self, items: Items, todo: Sequence[_Todo], shared: float) -> _Results:
+        """Retry queries with the fallback features, which are extracted; add the better results as items.
 
         Args:
             shared: seconds per query that the extraction took.
@@ -498,61 +471,52 @@ class _PairRun:
         Returns:
             As `localize_into`.
         """
-        assert isinstance(self.localizer, EscalatingLocalizer)
-        faulty: _Faulty = {}
-        of_number = {number: (name, source, row) for name, source, number, row in todo}
-        # The first poses take the place of a prediction.
-        tasks = ((number, *self.query(number), row["known"], shared) for number, (*_, row) in of_number.items())
-        for number, row, localized in self._localized(self.localizer.escalate, tasks, len(todo)):
-            name, source, first_row = of_number[number]
-            history = {
-                "first_status": first_row["status"],
-                "first_seconds": first_row["seconds"],
-                "seconds": round(first_row["seconds"] + row["seconds"], 4),
-            }
-            if _is_internal(row):
-                faulty[number] = row | history, localized
-            elif is_better(row["status"], first_row["status"]):
-                items.add(name, source, localized.arrays(), row | history)
+        faulty: _Results = {}
+        firsts = {one[2]: self._first(items, one) for one in todo}
+        of_number = {number: (name, source) for name, source, number in todo}
+        tasks = ((number, self.query(number), firsts[number], shared) for number in of_number)
+        for number, result in self._run(self.map.retry, tasks, len(todo)):
+            if result.is_internal:
+                faulty[number] = result
             else:
-                items.add(name, source, note=first_row | history)
+                better = result.correspondences is not firsts[number].correspondences
+                items.add(*of_number[number], result.arrays() if better else None, result.to_row(*self.keys[number]))
         return faulty
 
-    def _localized(
-        self, localize: Callable[..., PoseEstimate], tasks: Iterator[_Task], count: int
-    ) -> Iterator[tuple[int, dict[str, Any], LocalizedQuery]]:
-        """Yield queries with their rows and correspondences."""
-        results = prefetch(partial(self._localize, localize), tasks, self.stage.workers)
+    def _run(
+        self, locate: Callable[[Query, Any, Any], QueryResult], tasks: Iterator[_Task], count: int
+    ) -> Iterator[tuple[int, QueryResult]]:
+        """Yield the results of queries; `locate` takes a query, its references, and what else a task has."""
+
+        def run(task: _Task) -> tuple[int, QueryResult]:
+            number, (query, references), known, seconds = task
+            try:
+                if not query.views:
+                    method = self.map.settings.method
+                    return number, QueryResult.failed("no images of this device at this time", found_by=method)
+                result = locate(query, references, known)
+            except Exception as error:  # one bad query never ends a run
+                reason = reason_of(error, f"localizing {query.views[0].name}")
+                result = self.map.finished(query, QueryResult.failed(reason))
+            return number, replace(result, seconds=result.seconds + seconds)
+
+        results = prefetch(run, tasks, self.stage.workers)
         return iter(tqdm(results, total=count, desc=self._label, unit="query", disable=not count))
 
-    def _predicted(self, localizer: Localizer, numbers: Sequence[int]) -> Iterator[_Task]:
+    def _locate(self, query: Query, references: Sequence[References], prediction: Any) -> QueryResult:
+        return self.map.locate(query, None, references, prediction, fallback=False)
+
+    def _predicted(self, numbers: Sequence[int]) -> Iterator[_Task]:
         """Yield queries with the predictions of a network, which runs on batches of queries."""
-        size = localizer.batch_size
+        size = self.map.localizer.batch_size
         batches = [numbers[start : start + size] for start in range(0, len(numbers), size)]
         loaded = ([self.query(number) for number in batch] for batch in [*batches, []])
         for batch, (queries, following) in zip(batches, pairwise(loaded), strict=True):
             started = time.perf_counter()
-            predictions = localizer.predict(queries, following)
+            predictions = self.map.predict(queries, following)
             seconds = (time.perf_counter() - started) / len(batch)
             for number, query, prediction in zip(batch, queries, predictions, strict=True):
-                yield number, *query, prediction, seconds
-
-    def _localize(
-        self, localize: Callable[..., PoseEstimate], task: _Task
-    ) -> tuple[int, dict[str, Any], LocalizedQuery]:
-        number, query, references, prediction, seconds = task
-        started = time.perf_counter() - seconds
-        try:
-            if query.views:
-                estimate = self.map.judged(localize(query, references, prediction))
-            else:
-                estimate = PoseEstimate("failed: no images of this device at this time")
-        except Exception as error:  # one bad query never ends a run
-            estimate = PoseEstimate(f"failed: {reason_of(error, f'localizing {query.views[0].name}')}")
-        localized = localized_query(query, estimate, self.localizer.image_names)
-        found_by = "" if estimate.world_from_rig is None else estimate.found_by
-        row = _row(self.keys[number], estimate, localized, label(self.map.settings, found_by), started)
-        return number, row, localized
+                yield number, query, prediction, seconds
 
 
 def _localize_share(
@@ -561,74 +525,45 @@ def _localize_share(
     stage.run(map_device, query_device).localize_into(items, todo)
 
 
-def _escalate_share(
-    items: Items, todo: Sequence[_ToEscalate], stage: _Stage, map_device: str, query_device: str, shared: float
+def _retry_share(
+    items: Items, todo: Sequence[_Todo], stage: _Stage, map_device: str, query_device: str, shared: float
 ) -> None:
     run = stage.run(map_device, query_device)
-    run.add_escalation(todo)
-    run.escalate_into(items, todo, shared)
+    run.add_fallback(todo)
+    run.retry_into(items, todo, shared)
 
 
-def _is_internal(row: Mapping[str, Any]) -> bool:
-    return INTERNAL in row["status"] or INTERNAL in row["reason"]
+class _Localized:
+    """The table and the poses of a pair, collected while its correspondences are written."""
 
+    def __init__(self, images: Mapping[str, str], names: Sequence[str]) -> None:
+        """Take the name of each query's first image by the name of its item, and the names in the table's order."""
+        self._images, self._names = images, names
+        self._rows: dict[str, tuple[dict[str, Any], Floats, Floats]] = {}
+        self.unfinished = False
+        """Whether a query failed with an internal error."""
 
-def _row(
-    key: tuple[int, str], estimate: PoseEstimate, localized: LocalizedQuery, method: str, started: float
-) -> dict[str, Any]:
-    """Return the table row of a query, with its pose and covariance as lists for JSON."""
-    pose = None if estimate.world_from_rig is None else geometry.qt_from_pose(estimate.world_from_rig).tolist()
-    covariance = None if estimate.covariance is None else estimate.covariance.ravel().tolist()
-    focals = estimate.focals_px if np.isfinite(estimate.focals_px).any() else ()
-    centers = estimate.centers_px if np.isfinite(estimate.centers_px).any() else ()
-    return {
-        "timestamp": key[0],
-        "device_id": key[1],
-        "status": estimate.status,
-        "method": method,
-        "num_inliers": estimate.num_inliers,
-        "num_matches": estimate.num_matches,
-        "inlier_ratio": round(estimate.inlier_ratio, 4),
-        "num_guided": estimate.num_guided,
-        "rmse_px": round(estimate.rmse_px, 4),
-        "rival_support": round(estimate.rival_support, 4),
-        "coverage": round(estimate.coverage, 4),
-        "agreement": estimate.agreement,
-        "p_correct": round(estimate.p_correct, 4),
-        "position_std_m": round(estimate.position_std_m, 6),
-        "rotation_std_deg": round(estimate.rotation_std_deg, 6),
-        "references": ";".join(localized.references),
-        "seconds": round(time.perf_counter() - started, 4),
-        "focal_px": ";".join("" if np.isnan(focal) else f"{focal:.1f}" for focal in focals),
-        "principal_point_px": ";".join("" if np.isnan(x) else f"{x:.1f} {y:.1f}" for x, y in centers),
-        "scale_std": round(estimate.scale_std, 6),
-        "rejected": ";".join(localized.rejected),
-        "reason": estimate.reason,
-        "misfit": estimate.misfit,
-        "first_status": None,
-        "first_seconds": None,
-        "qt": pose,
-        "known": [pose.tolist() for pose in known_poses(estimate)],
-        "covariance": covariance,
-    }
+    def add(self, name: str, row: dict[str, Any], arrays: Mapping[str, Any]) -> None:
+        """Take the row of a query, and its pose and covariance from its arrays."""
+        self._rows[name] = row | {"image": self._images[name]}, arrays["world_from_rig"], arrays["covariance"]
 
-
-def _write_poses(pair: _Pair, rows: list[dict[str, Any]], settings: LocalizeSettings) -> None:
-    """Write the table and the poses of a pair; the poses last, because their file marks the pair as finished."""
-    columns = [*COLUMNS, *(PREDICTION_COLUMNS if settings.predicts else [])]
-    columns += ESCALATION_COLUMNS if settings.features.escalation else []
-    with write_atomic(pair.file("csv")) as temporary:
-        in_unit_of_poses(pd.DataFrame(rows, columns=columns), settings.unit).to_csv(temporary, index=False)
-    posed = [row for row in rows if row["qt"] is not None]
-    unknown = [float("nan")] * 36
-    covariances = [row["covariance"] or unknown for row in posed]
-    trajectory = Trajectory(
-        np.array([row["timestamp"] for row in posed], np.int64),
-        [row["device_id"] for row in posed],
-        np.array([row["qt"] for row in posed], np.float64).reshape(-1, 7),
-        np.array(covariances, np.float64).reshape(-1, 6, 6) if any(row["covariance"] for row in posed) else None,
-    )
-    trajectory.write(pair.file("txt"))
+    def write(self, pair: _Pair, settings: LocalizeSettings) -> None:
+        """Write table and poses; the poses last, because their file marks the pair as finished."""
+        columns = [*COLUMNS, *(PREDICTION_COLUMNS if settings.predicts else [])]
+        columns += FALLBACK_COLUMNS if settings.features.escalation else []
+        results = [self._rows[name] for name in self._names]
+        table = pd.DataFrame([row for row, _, _ in results], columns=columns)
+        with write_atomic(pair.file("csv")) as temporary:
+            in_unit_of_poses(table, settings.unit).to_csv(temporary, index=False)
+        posed = [result for result in results if np.isfinite(result[1]).all()]
+        covariances = np.array([covariance for _, _, covariance in posed]).reshape(-1, 6, 6)
+        trajectory = Trajectory(
+            np.array([row["timestamp"] for row, _, _ in posed], np.int64),
+            [row["device_id"] for row, _, _ in posed],
+            np.array([qt_from_pose(pose) for _, pose, _ in posed], np.float64).reshape(-1, 7),
+            None if np.isnan(covariances).all() else covariances,
+        )
+        trajectory.write(pair.file("txt"))
 
 
 def explain_query(
@@ -661,7 +596,7 @@ def explain_query(
     settings = resolve_auto(LocalizeSettings.of(settings, {"method": "feed_forward"}))
     folders = _Folders(*map(Path, (sessions_root, retrieval_dir, retrieval_dir, features_dir, map_dir)))
     run = _Stage(folders, settings, queries, skip_existing=True, workers=1).run(map_device, query_device)
-    localizer = run.localizer.inner if isinstance(run.localizer, ScaledLocalizer) else run.localizer
+    localizer = run.map.localizer
     assert isinstance(localizer, FeedForwardLocalizer)
     query, references = run.query(index)
     return localizer, query, localizer.answer(query, references)

@@ -206,19 +206,15 @@ class _Pair:
         name, references = _name(query), query["topk"][: self.settings.topn]
         if name not in query_store:
             return self._kept(query, query_store.failed.get(name, "no local features of the query image"))
-        readable = [reference for reference in references if _name(reference) in map_store]
-        if not readable:
+        names = [_name(reference) for reference in references]
+        if not any(name in map_store for name in names):
             return self._kept(query, "no reference has local features")
-        inliers, matches = verifier.verify(
-            query_store[name],
-            self.query_session.camera(query["sensor_id"]),
-            [_name(reference) for reference in readable],
-            [self.map_session.camera(reference["sensor_id"]) for reference in readable],
-        )
-        if not any(inliers):
+        cameras = [self.map_session.camera(reference["sensor_id"]) for reference in references]
+        camera = self.query_session.camera(query["sensor_id"])
+        counts = verifier.verify(query_store[name], camera, names, cameras)
+        if not any(counts[0]):
             return self._kept(query, "no reference agrees with the query by more than chance")
-        counts = dict(zip(map(_name, readable), zip(inliers, matches, strict=True), strict=True))
-        rows = [_entry(reference, *counts.get(_name(reference), (0, 0))) for reference in references]
+        rows = [_entry(*entry) for entry in zip(references, *counts, strict=True)]
         rows.sort(key=lambda row: (-row["score"], row["retrieval_rank"]))
         return _row(query, rows[: self.settings.topk], "")
 

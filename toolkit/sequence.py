@@ -5,7 +5,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
-from toolkit.capture.tables import POSE_NAMES, POSES_UNIT, KeyIndex, as_strings, in_unit_of_poses, read_query_table
-from toolkit.errors import INTERNAL, OF_THE_DATA, ArtifactError, reason_of
+from toolkit.capture.tables import POSE_NAMES, POSES_UNIT, KeyIndex, as_strings, in_unit_of_poses
+from toolkit.errors import OF_THE_DATA, ArtifactError, reason_of
 from toolkit.files import (
     SceneFiles,
     file_fingerprint,
@@ -34,8 +34,9 @@ from toolkit.files import (
 )
 from toolkit.geometry import Floats, Ints, pose_error
 from toolkit.manifest import SequenceSettings
-from toolkit.pose.base import PoseEstimate, RoughPose, stds_of
-from toolkit.scene.locate import localize_image
+from toolkit.pose.base import RoughPose
+from toolkit.pose.result import QueryResult, Status, status_counts, stds_of
+from toolkit.results.pair import PairResults
 from toolkit.scene.map import Map
 from toolkit.sequences.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
 from toolkit.sequences.odometry import (
@@ -153,7 +154,7 @@ def _place_pair(
     skipped = skip_existing and is_current(out, record)
     if not skipped:
         again = _Relocalizer(poses_dir, capture.name, map_device, session) if settings.relocalize else None
-        frames, steps, trajectory = _frames(session, _SingleQueries.read(poses, table), settings, again)
+        frames, steps, trajectory = _frames(session, _SingleQueries.of(PairResults.open(poses)), settings, again)
         unit = read_map_record(map_record_path(poses_dir, capture.name, map_device))["unit"]
         csvs = {out.with_suffix(".csv"): in_unit_of_poses(frames, unit), out.with_name(f"{out.stem}_steps.csv"): steps}
         for path, rows in csvs.items():
@@ -162,10 +163,9 @@ def _place_pair(
         trajectory.write(out)
         write_sidecar(out, record, list(csvs), made_from=inputs, unfinished=again is not None and again.met_a_bug)
     frames = pd.read_csv(out.with_suffix(".csv"), keep_default_na=False).rename(columns=POSES_UNIT)
-    status = frames["status"].str.split(":").str[0].value_counts()
     return {
         "frames": len(frames),
-        **{name: int(status.get(name, 0)) for name in ("ok", "low_confidence", "failed")},
+        **status_counts(frames["status"]),
         "pieces": len(frames[["recording", "piece"]].drop_duplicates()),
         "queries": int((frames["moved_m"] != "").sum()),
         "again": int((frames["again_status"] != "").sum()),
@@ -214,19 +214,15 @@ class _SingleQueries:
     """(Q, 6, 6)."""
 
     @classmethod
-    def read(cls, poses: Path, table: Path) -> "_SingleQueries":
-        rows, trajectory = read_query_table(table, ["status"]), Trajectory.read(poses)
-        rows = rows.drop_duplicates(["timestamp", "device_id"], ignore_index=True)
+    def of(cls, results: PairResults) -> "_SingleQueries":
+        rows = results.table.drop_duplicates(["timestamp", "device_id"], ignore_index=True)
+        results = replace(results, table=rows)
         status = rows["status"].to_numpy(object)
         evidence = rows.reindex(columns=["p_correct", "rival_support"]).to_numpy(float)
-        weights = vote_weights(np.asarray(status == "ok"), *evidence.T)
-        at = trajectory.index.find(rows["timestamp"].to_numpy(), as_strings(rows["device_id"]))
-        covariances = np.tile(UNKNOWN_COVARIANCE, (len(rows), 1, 1))
-        if (in_file := trajectory.covariances) is not None:
-            known = (at >= 0) & np.isfinite(in_file[at]).all(axis=(1, 2))
-            covariances[known] = in_file[at[known]]
-        poses_of_rows = trajectory.lookup(rows["timestamp"], rows["device_id"])
-        return cls(rows[["timestamp", "device_id"]], status, weights, poses_of_rows, covariances)
+        weights = vote_weights(np.asarray(status == Status.OK), *evidence.T)
+        known = np.asarray(np.isfinite(results.covariances).all(axis=(1, 2)), bool)
+        covariances = np.asarray(np.where(known[:, None, None], results.covariances, UNKNOWN_COVARIANCE))
+        return cls(rows[["timestamp", "device_id"]], status, weights, results.poses, covariances)
 
     def posed(self, rows: Ints) -> PosedQueries:
         """Return the queries with a pose among the frames of a piece; rows (N,) as `rows_of` returns them."""
@@ -263,32 +259,27 @@ class _Relocalizer:
             )
         return Map.open(self._run, self._scene, self._device)
 
-    def __call__(self, keys: pd.DataFrame, todo: Sequence[tuple[int, RoughPose]]) -> list[PoseEstimate]:
+    def __call__(self, keys: pd.DataFrame, todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
         """Localize frames again, each near a pose.
 
         Args:
             keys: table [timestamp, device_id] of all frames of the piece.
             todo: frames and their predicted poses.
         """
-        session, map_ = self._session, self._map
-        map_.load()
-        turns = None if map_.turns is None else map_.turns.of(session)
-        rows_of_each = session.rows_of_keyframes(keys.iloc[[frame for frame, _ in todo]])
+        self._map.load()
+        rows_of_each = self._session.rows_of_keyframes(keys.iloc[[frame for frame, _ in todo]])
 
-        def localize(number: int) -> PoseEstimate:
+        def localize(number: int) -> QueryResult:
             rows = rows_of_each[number]
-            cameras = session.cameras(rows)
-            paths = [session.image_path(int(row)) for row in rows]
             try:
-                poses = session.rig_from_cam(rows)
-                turned = None if turns is None else turns[rows].tolist()
-                return localize_image(map_, paths, cameras, poses, turned, todo[number][1])
+                return self._map.locate(self._map.query_of_session(self._session, rows), near=todo[number][1])
             except Exception as error:  # one bad query never ends a run
-                return PoseEstimate(f"failed: {reason_of(error, f'localizing {paths[0]} again')}")
+                path = self._session.image_path(int(rows[0]))
+                return QueryResult.failed(reason_of(error, f"localizing {path} again"))
 
-        estimates = list(prefetch(localize, range(len(todo)), default_workers()))
-        self.met_a_bug |= any(INTERNAL in estimate.status + estimate.reason for estimate in estimates)
-        return estimates
+        results = list(prefetch(localize, range(len(todo)), default_workers()))
+        self.met_a_bug |= any(result.is_internal for result in results)
+        return results
 
 
 def _frames(
@@ -320,7 +311,7 @@ def _frames(
         table["recording"], table["piece"], table["status"] = piece.recording, numbers[piece.recording], placed.status
         numbers[piece.recording] += 1
         table["single_status"] = np.append(singles.status, "")[piece.query]
-        table.loc[list(done.again), "again_status"] = [estimate.status for estimate in done.again.values()]
+        table.loc[list(done.again), "again_status"] = [result.status_text for result in done.again.values()]
         turned, moved = pose_error(placed.world_from_rig[frames], queries.world_from_rig)
         for name, values in (("moved_m", moved.round(6)), ("turned_deg", turned.round(6))):
             table.loc[frames, name] = values

@@ -3,7 +3,6 @@
 import re
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
@@ -21,8 +20,8 @@ from toolkit.figures.style import save_figure
 from toolkit.files import pair_name, require_current, sidecar_path, write_sidecar
 from toolkit.geometry import Floats
 from toolkit.manifest import VisualizeSettings
+from toolkit.results.images import LocalizedPair, support_of, sure_points
 from toolkit.results.metrics import is_posed, worst_first
-from toolkit.results.pair import LocalizedPair, support_of, sure_points
 from toolkit.runs.pairs import PairRows, left_out
 from toolkit.viewer.queries import record_localizations
 from toolkit.viewer.sessions import record_session, session_tracks
@@ -96,13 +95,12 @@ def visualize_scene(
             pair = LocalizedPair.open(capture, m, q, poses_dir, map_dir)
             sequences = SequencePair.find(poses_dir, capture.name, m, q)
             try:
-                with closing(pair.queries):
-                    worst.append(_draw_pair(capture, pair, sequences, out, settings))
+                worst.append(_draw_pair(capture, pair, sequences, out, settings))
             except DamagedError as error:
                 raise ArtifactError(str(error)) from None  # the localize stage can make the file again, this one cannot
             row |= {
-                "queries": len(pair.table),
-                "localized": int(is_posed(pair.world_from_rig).sum()),
+                "queries": len(pair.results.table),
+                "localized": int(is_posed(pair.results.poses).sum()),
                 "seconds": round(time.perf_counter() - started, 3),
                 "still": str(out / f"{pair.name}.png"),
                 "recording": str(out / f"{pair.name}.rrd") if settings.recordings else "",
@@ -179,18 +177,18 @@ def _draw_pair(
         title=f"{q} queries in the {m} map, seen from above",
         map_tracks=session_tracks(pair.map_session),
         query_tracks=session_tracks(pair.query_session),
-        unit=pair.unit,
+        unit=pair.results.unit,
     )
     save_figure(figure, out / f"{pair.name}.png", figure.get_suptitle())
     order = shown.worst_first().tolist()
     chosen = np.unique(np.linspace(0, len(order) - 1, min(settings.samples, len(order))).round().astype(int))
     for number, k in enumerate((order[rank] for rank in chosen), start=1):
-        title = f"{q} query in the {m} map: {pair.table['status'].iloc[k]}"
-        figure = draw_localization(details_of(k), title, pair.unit)
+        title = f"{q} query in the {m} map: {pair.results.table['status'].iloc[k]}"
+        figure = draw_localization(details_of(k), title, pair.results.unit)
         save_figure(figure, out / f"localization_{pair.name}_{number}.png", figure.get_suptitle())
     tracks: dict[str, list[Floats]] = {}
     if sequences is not None:
-        figure = draw_sequence(capture, sequences, m, q, settings.world_up, pair.unit)
+        figure = draw_sequence(capture, sequences, m, q, settings.world_up, pair.results.unit)
         save_figure(figure, out / f"{pair.name}_sequence.png")
         tracks = {"odometry": sequences.odometry_tracks(pair.query_session), "frames": sequences.tracks()}
     if settings.recordings:
@@ -202,7 +200,7 @@ def _draw_pair(
         )
     worst = order[:WORST]
     rows = shown.ranked.iloc[worst]
-    return rows.assign(unit=pair.unit[0], pair=f"{q} in the {m} map", details=[details_of(k) for k in worst])
+    return rows.assign(unit=pair.results.unit[0], pair=f"{q} in the {m} map", details=[details_of(k) for k in worst])
 
 
 def _poses(capture: Capture, poses_dir: str | Path, map_device: str, query_device: str) -> Path:

@@ -16,7 +16,7 @@ from toolkit.errors import ArtifactError, CaptureError
 from toolkit.geometry import make_pose, quaternion_to_rotation
 from toolkit.mapping.local_map import LocalMap
 from toolkit.pose.correspondences import LocalizedQuery
-from toolkit.results.pair import Localizations, QueryDetails, ShownImage
+from toolkit.results.images import Localizations, QueryDetails, ShownImage
 from toolkit.viewer.blueprint import scene_view, shown_intrinsics, small_jpeg, spawn_viewer
 from toolkit.viewer.queries import record_localizations
 from toolkit.viewer.sessions import record_session, session_tracks

@@ -208,7 +208,7 @@ def align_to_map(
 def query_pose(alignment: Alignment, model_from_query: ArrayLike) -> tuple[Floats, Floats]:
     """Return the pose of a predicted camera in the map, world_from_query (4, 4), and its covariance (6, 6).
 
-    The covariance follows `pose.base.PoseEstimate`: it is that of d in world_from_cam @ Exp(d), rotation in
+    The covariance follows `pose.result.QueryResult`: it is that of d in world_from_cam @ Exp(d), rotation in
     radians, then translation in meters. It adds three parts: the noise of the query's prediction (assumed equal to that
     of the references), the uncertainty of the alignment's rotation and scale times the distance from the references'
     centroid, and the uncertainty of the centroid. If the scale is unknown, its diagonal is infinite for the

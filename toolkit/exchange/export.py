@@ -9,7 +9,6 @@ ManifestError for an unknown choice of names, a capture that is in neither place
 """
 
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 
 from toolkit.capture import Session, Trajectory
 from toolkit.capture.cameras import camera_text
-from toolkit.capture.tables import POSE_NAMES, read_query_table
+from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import ArtifactError, ManifestError
 from toolkit.exchange.submission import open_captures
 from toolkit.features.stores import FeatureStore
@@ -39,7 +38,7 @@ from toolkit.files import (
 from toolkit.geometry import Floats, invert, pose_from_qt, qt_from_pose
 from toolkit.manifest import nearest
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.correspondences import LocalizedQueries
+from toolkit.results.pair import PairResults
 
 NAMES = ("own", "capture")
 Keypoints = Mapping[str, NDArray[np.floating]]
@@ -76,8 +75,7 @@ def export_colmap(
 def _maps_of(files: SceneFiles, device: str) -> list[Path]:
     """Return the files of the triangulated maps that a run localized with, one per kind of features."""
     for path in sorted(files.poses_dir.glob(f"{pair_name(files.scene, device, '*')}.h5")):
-        with closing(LocalizedQueries(path)) as queries:
-            maps = [files.maps / name for name in queries.maps]
+        maps = [files.maps / name for name in PairResults(path.with_suffix(".txt"), pd.DataFrame()).maps]
         if maps:
             require_current(path.with_suffix(".txt"), "localize", (".npz",))
             return maps
@@ -305,7 +303,7 @@ def export_intrinsics(
     path = _require_poses(SceneFiles(Path(run), scene).poses_csv(map_device, query_device))
     session = _session(run, scene, f"{query_device}_query", capture)
     lines = []
-    for rows in session.rows_of_keyframes(read_query_table(path, [])):
+    for rows in session.rows_of_keyframes(PairResults.open(path).table):
         for row in rows:
             camera = camera_text(session.camera(str(session.images["sensor_id"].iloc[row]))).replace(",", "")
             lines.append(f"{_listed(session.image_name(row), names, path)} {camera}")

@@ -22,10 +22,12 @@ from toolkit.capture import COLUMNS, Capture, Trajectory
 from toolkit.capture.check import UNIT_TOLERANCE
 from toolkit.capture.devices import SPLITS, extra_devices
 from toolkit.capture.names import allow_outside
-from toolkit.capture.tables import read_query_table, read_table
+from toolkit.capture.tables import read_table
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
 from toolkit.files import SceneFiles, pair_name, read_references, require_current, write_atomic
 from toolkit.geometry import Floats, invert, qt_from_pose, unit
+from toolkit.pose.result import Status
+from toolkit.results.pair import PairResults
 
 FAILED = ("nearest", "leave-out")
 SCENES = {"HYDRO": "HYDRO", "SUCCULENT": "SUCCU"}
@@ -202,7 +204,7 @@ def _answers(
     rows = poses.index.find(keyframes["timestamp"].to_numpy(np.int64), keyframes["device_id"])
     statuses, nearest, why_not = dict[Key, str](), dict[Key, Floats](), "not localized"
     if path.with_suffix(".csv").is_file():
-        run_table = read_query_table(path.with_suffix(".csv"), ["status"])
+        run_table = PairResults.open(path).table
         statuses = {(row.timestamp, row.device_id): row.status for row in run_table.itertuples()}
     if failed == "nearest" and np.any(rows < 0):
         require_current(files.poses_txt(*pair), "localize", (".jsonl",), missing=False)
@@ -213,7 +215,8 @@ def _answers(
     for index, key in enumerate(zip(keyframes["timestamp"].tolist(), keyframes["device_id"], strict=True)):
         status = statuses.get(key, "no row in the run's table")
         if rows[index] >= 0:
-            origin, reason = "low_confidence" if status.startswith("low_confidence") else "ok", ""
+            low = key in statuses and Status.parse(status)[0] is Status.LOW_CONFIDENCE
+            origin, reason = str(Status.LOW_CONFIDENCE if low else Status.OK), ""
         elif key in nearest:
             qt[index], origin, reason = qt_from_pose(nearest[key]), "nearest", status
         else:

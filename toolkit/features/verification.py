@@ -48,24 +48,27 @@ class Verifier:
 
         Args:
             features, camera: of the query image.
-            references, cameras: names and cameras of map images, all of which have features.
+            references, cameras: names and cameras of map images; one without features has no matches.
         """
-        features = self._strongest(features)
-        map_features = [self._map_features(name) for name in references]
+        features, counts = self._strongest(features), np.zeros((2, len(references)), np.int64)
+        readable = [index for index, name in enumerate(references) if name in self.store]
+        map_features = [self._map_features(references[index]) for index in readable]
         all_matches = self.matcher.match([(features, reference) for reference in map_features])
-        inliers = [
+        counts[0, readable] = [
             verified_matches(
                 camera,
                 features.keypoints[matches.indices[:, 0]],
-                reference_camera,
+                cameras[index],
                 reference.keypoints[matches.indices[:, 1]],
                 matches.scores,
                 self.settings,
-                tests=len(references),
+                tests=len(readable),
             ).distinct
-            for matches, reference, reference_camera in zip(all_matches, map_features, cameras, strict=True)
+            for matches, reference, index in zip(all_matches, map_features, readable, strict=True)
         ]
-        return inliers, [len(matches) for matches in all_matches]
+        counts[1, readable] = [len(matches) for matches in all_matches]
+        inliers, matched = counts.tolist()
+        return inliers, matched
 
     def _strongest(self, features: LocalFeatures) -> LocalFeatures:
         return features.take(slice(self.settings.max_features))

@@ -1,6 +1,6 @@
 """The result of localizing one query: status in words, numbers, correspondences, pose and rivals."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -11,11 +11,10 @@ import pandas as pd
 from toolkit.figures.style import number
 from toolkit.geometry import Floats
 from toolkit.manifest import LocalizeSettings
-from toolkit.pose.base import CAMERA
 from toolkit.pose.confidence import bounded_by_rivals
-from toolkit.pose.correspondences import Correspondences, LocalizedQuery, Rival
+from toolkit.pose.result import CAMERA, QueryResult, Status
+from toolkit.results.images import LocalizedPair, QueryDetails
 from toolkit.results.metrics import is_posed, pose_errors
-from toolkit.results.pair import LocalizedPair, QueryDetails
 
 LABELS = {
     "num_matches": ("descriptor matches", "{:.0f}"), "num_inliers": ("inliers among them", "{:.0f}"),
@@ -43,24 +42,9 @@ class Answer:
     pair: LocalizedPair
     number: int
     """Number of the query in the pair."""
-    status: str
-    """`ok`, `low_confidence...` or `failed: ...`."""
-    stated: str
-    """Reason that the localizer states besides the status."""
-    method: str
-    """Method that found the pose or, without a pose, that was tried."""
-    numbers: dict[str, float]
-    """The known ones of `LABELS`; lengths in `pair.unit`."""
-    localized: LocalizedQuery
-    """Names of images and references, correspondences, rivals."""
-    pose: Floats | None
-    """world_from_rig (4, 4), or world_from_cam of a camera without a rig; None without a pose."""
-    covariance: Floats | None
-    """(6, 6), see `PoseEstimate`; None if unknown."""
+    result: QueryResult
     settings: LocalizeSettings
     """Settings that it was localized with."""
-    seconds: float
-    """Time that it took."""
     retrieved: dict[str, tuple[int, float]] = field(default_factory=dict)
     """Rank, from 1, and score of each retrieved reference, by name; for a rig, the best rank among its cameras."""
 
@@ -73,12 +57,19 @@ class Answer:
     def headline(self) -> str:
         """Number, devices and status of the query."""
         devices = f"{self.pair.query_session.device} in the map of {self.pair.map_session.device}"
-        return f"query {self.number} of {devices}: {self.status}"
+        return f"query {self.number} of {devices}: {self.result.status_text}"
+
+    @cached_property
+    def numbers(self) -> dict[str, float]:
+        """The known ones of `LABELS`; lengths in the pair's unit."""
+        numbers = {name: float(getattr(self.result, name)) for name in LABELS}
+        numbers["position_std_m"] /= self.pair.results.unit[1]
+        return {name: value for name, value in numbers.items() if np.isfinite(value)}
 
     @property
     def reason(self) -> str:
         """Why it has this status, in words."""
-        return reason_in_words(self.status, self.stated, self.numbers, self.settings, self.method)
+        return reason_in_words(self.result, self.numbers, self.settings)
 
     @property
     def caption(self) -> str:
@@ -96,22 +87,20 @@ class Answer:
     @property
     def texts(self) -> dict[str, str]:
         """The known numbers, errors and seconds as texts by their label."""
-        by_network, unit = _is_by_network(self.method), self.pair.unit[0]
+        by_network, unit = _is_by_network(self.result.found_by), self.pair.results.unit[0]
         labels = LABELS | OF_NETWORKS if by_network else LABELS
         hidden = set(OF_MATCHES) if by_network else set[str]()
-        if self.pose is not None and not self.numbers.get("num_matches"):
+        if self.result.world_from_rig is not None and not self.numbers.get("num_matches"):
             hidden = {*OF_MATCHES, *OF_NETWORKS}
         if not self.numbers.get("agreement"):
             hidden.add("agreement")
         shown = {name: each for name, each in labels.items() if name in self.numbers and name not in hidden}
         texts = {label.format(unit=unit): form.format(self.numbers[name]) for name, (label, form) in shown.items()}
-        texts = {"method": self.method, **texts}
-        if self.rivals is None:
-            texts["other poses"] = "not kept"
+        texts = {"method": self.result.found_by, **texts}
         if self.error is not None:
             texts[f"true position error [{unit}]"] = _digits(self.error[1])
             texts["true rotation error [deg]"] = _digits(self.error[0])
-        return {**texts, "seconds": f"{self.seconds:.2f}"}
+        return {**texts, "seconds": f"{self.result.seconds:.2f}"}
 
     @property
     def rig_from_cam(self) -> Floats:
@@ -120,20 +109,10 @@ class Answer:
         names = [session.image_name(int(row)) for row in rows]
         return np.asarray(session.rig_from_cam(rows)[names.index(self.details.cameras[0].name)])
 
-    @property
-    def correspondences(self) -> Correspondences:
-        return self.localized.correspondences
-
-    @property
-    def rivals(self) -> Sequence[Rival] | None:
-        """Other poses that some matches support; None: the run is too old to have stored them."""
-        return self.localized.rivals
-
     @cached_property
     def details(self) -> QueryDetails:
         """Its images and references, with their correspondences."""
-        no_pose = np.full((4, 4), np.nan)
-        return self.pair.details(self.number, self.localized, no_pose if self.pose is None else self.pose)
+        return self.pair.details(self.number, self.result)
 
     @property
     def true_pose(self) -> Floats | None:
@@ -144,16 +123,17 @@ class Answer:
 
     @property
     def error(self) -> tuple[float, float] | None:
-        """Rotation error, degrees, and position error in `pair.unit`; None without a pose or ground truth."""
-        if self.pose is None or self.true_pose is None:
+        """Rotation error, degrees, and position error in the pair's unit; None without a pose or ground truth."""
+        pose, true_pose = self.result.world_from_rig, self.true_pose
+        if pose is None or true_pose is None:
             return None
-        rotation_deg, translation = pose_errors(self.pose[None], self.true_pose[None])
-        return float(rotation_deg[0]), float(translation[0]) / self.pair.unit[1]
+        rotation_deg, translation = pose_errors(pose[None], true_pose[None])
+        return float(rotation_deg[0]), float(translation[0]) / self.pair.results.unit[1]
 
     @cached_property
     def matches(self) -> pd.DataFrame:
         """Counts of the correspondences: one row per kind (`sift/guided`), columns agree and rejected."""
-        matches = self.correspondences
+        matches = self.result.correspondences
         counts = pd.DataFrame({"agree": matches.inlier, "rejected": ~matches.inlier}, dtype=int)
         return counts.groupby(pd.Index(matches.found_by.astype(object), name="found by")).sum()
 
@@ -165,8 +145,8 @@ class Answer:
         the pose was computed from it); rejected (whether it contradicts the used references); shared (points
         that agree with the pose and that it observes; missing if its views were not stored).
         """
-        retrieved, matches, used = self.retrieved, self.correspondences, self.localized.references
-        names = list(dict.fromkeys([*used, *self.localized.rejected, *retrieved]))
+        retrieved, matches, used = self.retrieved, self.result.correspondences, self.result.references
+        names = list(dict.fromkeys([*used, *self.result.rejected, *retrieved]))
         kept = set(matches.view_reference.tolist())
         rows = []
         for name in names:
@@ -174,7 +154,7 @@ class Answer:
             number = used.index(name) if name in used else -1
             seen = matches.view_of[matches.view_reference == number]
             shared = int(matches.inlier[seen].sum()) if number in kept else None
-            rows.append((name, rank, score, name in used, name in self.localized.rejected, shared))
+            rows.append((name, rank, score, name in used, name in self.result.rejected, shared))
         table = pd.DataFrame(rows, columns=["name", "rank", "score", "used", "rejected", "shared"])
         return table.astype({"rank": "Int64", "shared": "Int64"})
 
@@ -197,28 +177,24 @@ def _digits(value: float) -> str:
     return np.format_float_positional(value, 2, fractional=False, trim="-") if value < 0.1 else number(value)
 
 
-def reason_in_words(
-    status: str, stated: str, numbers: Mapping[str, float], settings: LocalizeSettings, method: str = "pnp"
-) -> str:
+def reason_in_words(result: QueryResult, numbers: Mapping[str, float], settings: LocalizeSettings) -> str:
     """Return in a sentence why a query has its status.
 
     Args:
-        stated: reason that the localizer states besides the status.
         numbers: the known ones of `LABELS`.
         settings: settings of the localization, which hold the limits.
-        method: method of the pose; for `feed_forward`, inliers are references, not matches.
     """
-    kind, _, detail = status.partition(": ")
-    more = f" {stated[0].upper()}{stated[1:]}." if stated else ""
-    if kind == "failed":
+    detail, method = result.reason, result.found_by
+    more = f" {result.remark[0].upper()}{result.remark[1:]}." if result.remark else ""
+    if result.status is Status.FAILED:
         return _why_failed(detail, numbers, settings) + more
-    if status == CAMERA:
+    if detail == CAMERA:
         return "The matches contradict the camera's intrinsics." + more
     if detail:
         return f"{detail[0].upper()}{detail[1:]}.{more}"
     if settings.method == "nearest":
         return "This is the unchanged pose of the best reference, which is never called ok." + more
-    if kind == "low_confidence":
+    if result.status is Status.LOW_CONFIDENCE:
         return " ".join([*_doubts(numbers, settings), *_support(numbers, method)]) + more
     return " ".join(_support(numbers, method)) + more
 

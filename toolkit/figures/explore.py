@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from toolkit.capture import Capture, Session, Trajectory
+from toolkit.capture import Capture, Session
 from toolkit.capture.devices import color_of
-from toolkit.capture.tables import POSE_NAMES, read_query_table
+from toolkit.capture.tables import POSE_NAMES
 from toolkit.embedders import embedding_folders, open_descriptors
 from toolkit.errors import CaptureError
 from toolkit.figures.query_images import draw_image
@@ -18,7 +18,9 @@ from toolkit.figures.style import GREEN, ORANGE, VERMILLION, new_figure, plain_l
 from toolkit.figures.top_view import Ground, Layer, draw_places
 from toolkit.files import image_name, pair_devices, read_references
 from toolkit.geometry import Floats, qt_from_pose, unit
+from toolkit.pose.result import statuses
 from toolkit.results.metrics import is_posed
+from toolkit.results.pair import PairResults
 from toolkit.sequences.odometry import Odometry, recordings_of
 
 if TYPE_CHECKING:
@@ -74,8 +76,8 @@ def list_poses(path: str | Path) -> pd.DataFrame:
     Args:
         path: the pair's `.csv`.
     """
-    table = read_query_table(Path(path), ["status"])
-    poses = Trajectory.read(Path(path).with_suffix(".txt")).lookup(table["timestamp"].to_numpy(), table["device_id"])
+    results = PairResults.open(path)
+    table, poses = results.table, results.poses
     rows = np.full((len(table), len(POSE_NAMES)), np.nan)
     rows[is_posed(poses)] = qt_from_pose(poses[is_posed(poses)])
     return table.reindex(columns=["image", "status"]).join(pd.DataFrame(rows, columns=POSE_NAMES))
@@ -213,12 +215,13 @@ def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
     Args:
         paths: poses of each pair, `<scene>_map_<M>_query_<Q>.txt` or `.csv`.
     """
-    tables = {pair_devices(Path(path).stem): pd.read_csv(Path(path).with_suffix(".csv")) for path in paths}
+    pairs = [PairResults.open(path) for path in paths]
+    tables = {results.devices: results.table for results in pairs}
     figure = new_figure(8, 0.35 * len(tables) + 1.2)
     plot = figure.subplots()
     colors = {"ok": GREEN, "low_confidence": ORANGE, "failed": VERMILLION}
     for status, color in colors.items():
-        rows = [table[table["status"].str.startswith(status)] for table in tables.values()]
+        rows = [table[statuses(table["status"]) == status] for table in tables.values()]
         inliers = np.concatenate([row["num_inliers"].fillna(0).to_numpy(float) for row in rows])
         heights = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
         label = f"{status.replace('_', ' ')}: {len(inliers)}"

@@ -8,27 +8,27 @@ import textwrap
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from toolkit.capture import Capture, Trajectory
+from toolkit.capture import Capture
 from toolkit.errors import OF_THE_DATA, ArtifactError
-from toolkit.figures.answers import LABELS, Answer
+from toolkit.figures.answers import Answer
 from toolkit.figures.choice import find_query, shown_name
 from toolkit.figures.inspection_view import draw_answers
 from toolkit.figures.style import shown
 from toolkit.files import SceneFiles, image_name, pair_devices, read_references, require_current
-from toolkit.geometry import Floats
 from toolkit.manifest import LocalizeSettings, nearest
-from toolkit.pose.correspondences import LocalizedQuery
-from toolkit.results.metrics import is_posed, worst_first
-from toolkit.results.pair import LocalizedPair
-from toolkit.scene.map import RETRIEVAL, SESSIONS_ROOT, Map, how_localized, label
-from toolkit.scene.relocalize import LocalizeAgain
+from toolkit.pose.result import QueryResult
+from toolkit.results.images import LocalizedPair
+from toolkit.results.metrics import worst_first
+from toolkit.scene.map import WITHOUT_FEATURES, Map
+from toolkit.scene.opening import RETRIEVAL, SESSIONS_ROOT, how_localized
+from toolkit.scene.stored import StoredQueries
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -81,7 +81,8 @@ class Comparison:
     def table(self) -> pd.DataFrame:
         """Status, method, numbers, errors and seconds as texts; columns before and after."""
         both = {"before": self.before, "after": self.after}
-        return pd.DataFrame({name: {"status": one.status, **one.texts} for name, one in both.items()}, dtype=object)
+        texts = {name: {"status": one.result.status_text, **one.texts} for name, one in both.items()}
+        return pd.DataFrame(texts, dtype=object)
 
     @cached_property
     def figure(self) -> "Figure":
@@ -160,49 +161,33 @@ class InspectedPair:
         names = self.localized.query_session.image_names
         images = {names[row]: number for number, rows in enumerate(self.localized.rows) for row in rows}
         number = find_query(query, images, len(self))
-        row = self.localized.table.iloc[number]
-        found = {name: value for name, value in row.items() if pd.notna(value)}
-        found["covariance"] = self._covariances.get((int(row["timestamp"]), str(row["device_id"])))
-        return self._inspection(
-            number, found, self.localized.world_from_rig[number], self.localized.localized(number), self.settings
-        )
+        return self._inspection(number, self.localized.results[number], self.settings)
 
     def localize(self, number: int, changes: Mapping[str, Any]) -> Inspection:
         """Localize a query again; see `Inspection.again`."""
-        settings = self._again.settings(changes)
-        estimate, localized, seconds = self._again.localize(self.localized.rows[number], settings)
-        found = {name: getattr(estimate, name) for name in (*LABELS, "status", "reason", "covariance")}
-        found["method"] = label(settings, "" if estimate.world_from_rig is None else estimate.found_by)
-        return self._inspection(number, found | {"seconds": seconds}, estimate.world_from_rig, localized, settings)
+        scene_map = self._changed(json.dumps(changes))
+        query, references = self._stored.query(scene_map, self.localized.rows[number])
+        return self._inspection(number, scene_map.locate(query, references=references), scene_map.settings)
 
-    def _inspection(
-        self, number: int, found: Mapping[str, Any], pose: Floats | None, localized: LocalizedQuery,
-        settings: LocalizeSettings,
-    ) -> Inspection:  # fmt: skip
-        """Return a result; `found`: its status, reason, method, covariance, seconds and numbers, as far as known."""
-        numbers = {name: float(found[name]) for name in LABELS if name in found and np.isfinite(found[name])}
-        if "position_std_m" in numbers:
-            numbers["position_std_m"] /= self.localized.unit[1]
-        covariance, (stated, method) = found["covariance"], (str(found.get(name, "")) for name in ("reason", "method"))
-        return Inspection(
-            self.localized, number, str(found["status"]), stated, method, numbers,
-            localized, pose if pose is not None and is_posed(pose) else None,
-            covariance if covariance is not None and np.isfinite(covariance).all() else None,
-            settings, float(found.get("seconds", np.nan)), self._retrieved(number), of=self,
-        )  # fmt: skip
+    def _inspection(self, number: int, result: QueryResult, settings: LocalizeSettings) -> Inspection:
+        return Inspection(self.localized, number, result, settings, self._retrieved(number), of=self)
 
     @cached_property
-    def _again(self) -> LocalizeAgain:
+    def _map(self) -> Map:
         """Cached: opening the map takes time."""
-        require_current(self._h5.with_suffix(".txt"), "localize", missing=False)
-        map_ = Map.of_pair(self._h5, self.map_device, self._features_dir, self._map_dir)
-        return LocalizeAgain(map_, self.localized.query_session, self.retrieval)
+        self.localized.results.require_current()
+        return Map.of_pair(self._h5, self.map_device, self._features_dir, self._map_dir)
 
     @cached_property
-    def _covariances(self) -> dict[tuple[int, str], Floats]:
-        poses = Trajectory.read(self._h5.with_suffix(".txt"))
-        keys = zip(poses.timestamps.tolist(), map(str, poses.device_ids), strict=True)
-        return {} if poses.covariances is None else dict(zip(keys, poses.covariances, strict=True))
+    def _stored(self) -> StoredQueries:
+        stored = StoredQueries(self.localized.query_session, self.retrieval)
+        if self._map.settings.method not in WITHOUT_FEATURES:
+            stored.open_features(self._map)
+        return stored
+
+    @lru_cache(maxsize=8)  # noqa: B019 - lives as long as the pair
+    def _changed(self, changes: str) -> Map:
+        return self._map.changed(json.loads(changes))
 
     @cached_property
     def _topk(self) -> dict[tuple[int, str], list[dict[str, Any]]]:

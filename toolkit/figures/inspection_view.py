@@ -12,9 +12,9 @@ from toolkit.figures.query_images import PURPLE, draw_image, draw_joined, draw_m
 from toolkit.figures.style import BLUE, ESTIMATED, GRAY, MAP, ORANGE, TRUE, new_figure, styled
 from toolkit.figures.top_view import Ground, Layer, Places, draw_layers, window_of
 from toolkit.geometry import Floats, shifted
-from toolkit.pose.correspondences import Correspondences
+from toolkit.pose.result import Correspondences
+from toolkit.results.images import sure_points
 from toolkit.results.metrics import is_posed
-from toolkit.results.pair import sure_points
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,9 +42,9 @@ def draw_answers(answers: Sequence[Answer], title: str) -> "Figure":
     for axis, answer, name in zip(above.subplots(1, len(answers), squeeze=False)[0], answers, NAMES, strict=False):
         draw_joined(axis, answer.details, 3.3, by_kind=True)
         axis.set_axis_off()
-        of_answer = f"{name}: {answer.status}\n{textwrap.fill(answer.reason, 78)}"
+        of_answer = f"{name}: {answer.result.status_text}\n{textwrap.fill(answer.reason, 78)}"
         axis.set_title(of_answer if several else answer.caption, fontsize=8.5)
-        if marks := _marks_of(answer.correspondences):
+        if marks := _marks_of(answer.result.correspondences):
             axis.legend(handles=marks, loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3 if several else 6,
                         fontsize=7.5)  # fmt: skip
     for part in strip:
@@ -87,7 +87,7 @@ def _ground_and_cameras(answer: Answer) -> tuple[Ground, Floats]:
     """Return the ground of the map, and the poses of its cameras (N, 4, 4)."""
     poses = answer.pair.map_session.world_from_cam()
     poses = poses[is_posed(poses)]
-    return Ground.below(poses, answer.settings.world_up, answer.pair.unit), poses
+    return Ground.below(poses, answer.settings.world_up, answer.pair.results.unit), poses
 
 
 def _cameras_of(answers: Sequence[Answer]) -> list[tuple[Floats, str, str]]:
@@ -95,7 +95,8 @@ def _cameras_of(answers: Sequence[Answer]) -> list[tuple[Floats, str, str]]:
     # A rig is shown by the camera that the first answer draws.
     rig_from_cam, true = answers[0].rig_from_cam, answers[0].true_pose
     names = NAMES if len(answers) > 1 else ("estimated",)
-    poses = [*zip((answer.pose for answer in answers), names, COLORS, strict=False), (true, "true", TRUE)]
+    estimated = (answer.result.world_from_rig for answer in answers)
+    poses = [*zip(estimated, names, COLORS, strict=False), (true, "true", TRUE)]
     return [(pose @ rig_from_cam, name, color) for pose, name, color in poses if pose is not None]
 
 
@@ -114,7 +115,7 @@ def _draw_from_above(axis: "Axes", answers: Sequence[Answer]) -> None:
     references = np.array([image.world_from_cam for image in answer.details.references]).reshape(-1, 4, 4)
     references = references[is_posed(references)]
     shown = _cameras_of(answers)
-    rivals = [(rival.world_from_rig @ answer.rig_from_cam, rival.support) for rival in answers[-1].rivals or ()]
+    rivals = [(rival.world_from_rig @ answer.rig_from_cam, rival.support) for rival in answers[-1].result.rivals]
     layers = [
         Layer(points, None, "0.75", s=1, lw=0, rasterized=True),
         Layer(cameras, "map cameras", MAP, s=7, lw=0),
@@ -148,18 +149,18 @@ def _draw_near(axis: "Axes", answers: Sequence[Answer]) -> None:
     """Draw the positions of the answers and the truth, enlarged to show the uncertainty."""
     from matplotlib.patches import Ellipse
 
-    posed = [answer for answer in answers if answer.pose is not None]
+    posed = [answer for answer in answers if answer.result.world_from_rig is not None]
     if not posed:
         axis.set_axis_off()
         axis.text(0.5, 0.5, "no pose", ha="center", va="center", color=GRAY)
         return
-    unit, length = posed[0].pair.unit
+    unit, length = posed[0].pair.results.unit
     ground, shown = _ground_and_cameras(posed[0])[0], _cameras_of(answers)
     origin = -shown[0][0][:3, 3]
     shown = [(shifted(pose, origin), name, color) for pose, name, color in shown]
     ellipses, reach = [], [float(np.abs(ground.flat(pose)).max()) for pose, _, _ in shown]
     for (pose, name, color), answer in zip(shown, posed, strict=False):  # the truth is shown last
-        if answer.covariance is None:
+        if answer.result.covariance is None:
             continue
         spread = ground.axes @ _position_covariance(answer, answers[0].rig_from_cam) @ ground.axes.T
         values, vectors = np.linalg.eigh(spread)
@@ -186,12 +187,12 @@ def _position_covariance(answer: Answer, rig_from_cam: Floats) -> Floats:
 
     A small motion of the rig in its own frame, rotation w and translation t, moves a camera at c by t + w x c.
     """
-    assert answer.pose is not None
-    assert answer.covariance is not None
+    assert answer.result.world_from_rig is not None
+    assert answer.result.covariance is not None
     x, y, z = rig_from_cam[:3, 3]
     lever = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
-    moves = answer.pose[:3, :3] @ np.hstack([lever, np.eye(3)])
-    return np.asarray(moves @ answer.covariance @ moves.T)
+    moves = answer.result.world_from_rig[:3, :3] @ np.hstack([lever, np.eye(3)])
+    return np.asarray(moves @ answer.result.covariance @ moves.T)
 
 
 def _draw_table(axis: "Axes", answers: Sequence[Answer]) -> None:

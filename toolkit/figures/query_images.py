@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from toolkit.capture.images import read_for_display
 from toolkit.figures.style import ESTIMATED, GREEN, SKY, inches_to_pixels
 from toolkit.geometry import Floats
-from toolkit.results.pair import QueryDetails, ShownImage
+from toolkit.results.images import QueryDetails, ShownImage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -23,8 +23,8 @@ from toolkit.figures.style import (
 )
 from toolkit.figures.top_view import Ground, Layer, draw_places
 from toolkit.geometry import Floats, pose_error, project
+from toolkit.results.images import QueryDetails
 from toolkit.results.metrics import is_posed
-from toolkit.results.pair import QueryDetails
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

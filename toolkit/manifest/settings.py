@@ -429,7 +429,7 @@ class PnpSettings(Settings):
         "guided_radii_deg max_guided_matches ok_rival_support",
         "pose/rig.py": "max_ransac_matches ransac_max_trials",
         "pose/map_matching.py": "guided_images max_map_features max_query_features",
-        "pose/escalation.py": "sure_position_std_m",
+        "scene/map.py": "sure_position_std_m",
     }
     ransac_max_error_deg: PositiveNumber = 0.45
     """Largest reprojection error of an inlier in RANSAC, degrees."""

@@ -15,7 +15,7 @@ from toolkit.geometry import Floats
 EVIDENCE = (
     "num_inliers", "inlier_ratio", "coverage", "rival_support", "position_std_m", "rotation_std_deg", "agreement"
 )  # fmt: skip
-"""Inputs of the regression: attributes of `PoseEstimate` and columns of `poses/<pair>.csv`."""
+"""Inputs of the regression: attributes of `QueryResult` and columns of `poses/<pair>.csv`."""
 WEIGHTS: dict[str, float] = {
     "constant": -2.1948,
     "log_inliers": 1.2564,

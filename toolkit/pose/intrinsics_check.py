@@ -28,7 +28,7 @@ from toolkit import geometry
 from toolkit.alignment.robust import Bools
 from toolkit.capture.cameras import projection_jacobian
 from toolkit.geometry import Floats
-from toolkit.pose.base import CONFIRMED
+from toolkit.pose.result import AGREEMENT
 from toolkit.pose.rig import Matches, RigQuery
 
 SIGNIFICANCE = 1e-4
@@ -376,6 +376,6 @@ class _Problem:
                     by_chance[camera, kind] = step.probability(changes, tested)
                     motion = np.linalg.solve(information[:6, :6], information[:6, tested] @ changes[tested])
                     sizes = np.degrees(np.linalg.norm(motion[:3])), np.linalg.norm(motion[3:])
-                    shares[camera, kind] = max(np.divide(sizes, CONFIRMED))
+                    shares[camera, kind] = max(np.divide(sizes, AGREEMENT))
         at_fault = by_chance <= max(SIGNIFICANCE, float(by_chance.min()))
         return Misfit(_motion(start, fitted), fitted.parameters.reshape(-1, 4), np.where(at_fault, shares, 0.0))

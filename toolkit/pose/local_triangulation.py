@@ -24,9 +24,10 @@ from toolkit.manifest import MapSettings, PnpSettings
 from toolkit.mapping.build import MAX_EPIPOLAR_ERROR_PX, instants, match_pairs, select_pairs
 from toolkit.mapping.local_map import LocalMap
 from toolkit.mapping.triangulation import triangulate
-from toolkit.pose.base import NetworkMatches, PoseEstimate, Prior, Query, References, WithoutNetwork
+from toolkit.pose.base import Localizer, NetworkMatches, Prior, Query, References
 from toolkit.pose.map_matching import MappedFeatures
-from toolkit.pose.pnp import PnpLocalizer
+from toolkit.pose.pnp import PnpLocalizer, PnpMatches
+from toolkit.pose.result import QueryResult
 from toolkit.threads import fixed_sums
 
 FeatureSource = Callable[[str], LocalFeatures]
@@ -72,7 +73,7 @@ class PosedImages:
         return cls(names, session.cameras(rows), poses, instants(session, rows))
 
 
-class OnDemandLocalizer(WithoutNetwork):
+class OnDemandLocalizer(Localizer):
     """Localizes with triangulated maps of some kinds of features, and for other kinds with points made for each query.
 
     Safe to use from several threads.
@@ -102,10 +103,8 @@ class OnDemandLocalizer(WithoutNetwork):
         self.image_names = posed.names
 
     @fixed_sums
-    def localize(
-        self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()
-    ) -> PoseEstimate:
-        """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`."""
+    def match(self, query: Query, references: Sequence[References]) -> PnpMatches:
+        """Return the matches of a query, with a map that has the points of its references; see `Localizer`."""
         images = np.unique(np.concatenate([np.zeros(0, np.int64), *(retrieved.images for retrieved in references)]))
         names = [self.posed.names[index] for index in images]
         mapped, point_index, first_point = [], [], 0
@@ -127,12 +126,16 @@ class OnDemandLocalizer(WithoutNetwork):
             point_index.append(np.full(len(local_map.points), -1))  # these points are in no map file
             for of_camera, of_kind in zip(matches, new_matches, strict=True):
                 of_camera.append(of_kind.__getitem__)
-        estimate = PnpLocalizer(mapped, self._settings, self._seed).localize(
-            replace(query, network_matches=matches), references, None, priors
-        )
-        used = estimate.correspondences
-        index = np.concatenate([np.zeros(0, np.int64), *point_index])[used.point_index]
-        return replace(estimate, correspondences=replace(used, point_index=index))
+        localizer, stored = PnpLocalizer(mapped, self._settings, self._seed), np.concatenate(point_index)
+        return PnpMatches(replace(query, network_matches=matches), references, localizer, stored)
+
+    @fixed_sums
+    def solve(self, matches: PnpMatches, prediction: None = None, priors: Sequence[Prior] = ()) -> QueryResult:
+        """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`."""
+        result = matches.localizer.solve(matches, prediction, priors)
+        used = result.correspondences
+        index = np.concatenate([np.zeros(0, np.int64), *([] if matches.point_index is None else [matches.point_index])])
+        return replace(result, correspondences=replace(used, point_index=index[used.point_index]))
 
     def _match(
         self,

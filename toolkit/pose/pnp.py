@@ -10,7 +10,8 @@ Several kinds of features can be used together: one pose is estimated from the p
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,20 +20,11 @@ from toolkit import geometry
 from toolkit.alignment.robust import Bools
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import PnpSettings
-from toolkit.pose.base import (
-    CAMERA,
-    NetworkMatches,
-    PoseEstimate,
-    Prior,
-    Query,
-    References,
-    WithoutNetwork,
-    agree,
-)
+from toolkit.pose.base import Localizer, Prior, Query, QueryMatches, References
 from toolkit.pose.confidence import EVIDENCE, bounded_by_deviation, bounded_by_rivals, probability_right
-from toolkit.pose.correspondences import Correspondences, Rival
 from toolkit.pose.intrinsics_check import find_misfit
 from toolkit.pose.map_matching import MapMatcher, MappedFeatures, MatchCache, Vicinity
+from toolkit.pose.result import CAMERA, Correspondences, QueryResult, Rival, Status, agree
 from toolkit.pose.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.threads import fixed_sums
 
@@ -85,7 +77,41 @@ class _Hypothesis:
         return geometry.invert(self.rig_from_world)
 
 
-class PnpLocalizer(WithoutNetwork):
+@dataclass(frozen=True)
+class PnpMatches(QueryMatches):
+    """Matches of a query by descriptors alone. Those with a reference are computed when they are first needed."""
+
+    localizer: "PnpLocalizer"
+    """Localizer in the map that has the matched points."""
+    point_index: Ints | None = None
+    """If that map was made for the query: for each of its points, the index in the stored maps, -1 for none."""
+    cache: MatchCache = field(default_factory=dict)
+
+    @cached_property
+    def usable(self) -> list[int]:
+        """Indices of the images with features; only these are matched."""
+        return [index for index, features in enumerate(self.query.features) if not isinstance(features, str)]
+
+    @cached_property
+    def rig(self) -> RigQuery:
+        """Cameras and features of the usable images."""
+        return RigQuery(
+            [self.query.views[index].camera for index in self.usable],
+            np.asarray(self.query.rig_from_cams, np.float64)[self.usable],
+            [features for features in self.query.features if not isinstance(features, str)],
+        )
+
+    @cached_property
+    def references_of_usable(self) -> list[References]:
+        return [self.references[index] for index in self.usable]
+
+    def with_references(self, references: Sequence[References]) -> Matches:
+        """Return the matches of each usable image with some of its references."""
+        stored = [self.query.network_matches[index] for index in self.usable] if self.query.network_matches else []
+        return self.localizer.matcher.by_descriptors(self.rig, references, stored, self.cache)
+
+
+class PnpLocalizer(Localizer):
     """Localizes queries in one map by matching and PnP, with one or several kinds of features.
 
     Safe to use from several threads; the map is never changed.
@@ -105,60 +131,41 @@ class PnpLocalizer(WithoutNetwork):
         """Covariance (6, 6) of a pose of the map. A query's pose is as far off as the map's poses around it are."""
         self.matcher = MapMatcher(mapped)
         self.map = self.matcher.map
+        self.image_names = self.map.image_names
 
-    @property
-    def image_names(self) -> list[str]:
-        return self.map.image_names
+    def match(self, query: Query, references: Sequence[References]) -> PnpMatches:
+        """Return the matches of a query with its references; see `Localizer`."""
+        return PnpMatches(query, references, self)
 
     @fixed_sums
-    def localize(
-        self, query: Query, references: Sequence[References], prediction: None = None, priors: Sequence[Prior] = ()
-    ) -> PoseEstimate:
+    def solve(self, matches: PnpMatches, prediction: None = None, priors: Sequence[Prior] = ()) -> QueryResult:
         """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`.
 
         Images without features are left out. A prior is one more hypothesis: it wins if it has clearly more
         support. A prior that agrees with an `ok` pose changes nothing.
         """
-        usable = [index for index, features in enumerate(query.features) if not isinstance(features, str)]
-        if len(usable) < len(query.features):
-            return self._localize_part(query, usable, references, priors)
+        missing = "; ".join(features for features in matches.query.features if isinstance(features, str))
+        if not matches.usable:
+            return QueryResult.failed(f"no readable image ({missing})")
+        references = matches.references_of_usable
         if not any(len(retrieved.images) for retrieved in references):
-            return PoseEstimate("failed: no references")
-        rig = RigQuery(
-            [view.camera for view in query.views],
-            np.asarray(query.rig_from_cams, np.float64),
-            [features for features in query.features if not isinstance(features, str)],
-        )
-        matches, first_matches, start = self._first_pose(rig, references, query.network_matches)
-        hypotheses = [] if start is None else self._hypotheses(rig, start, first_matches, matches, references)
+            return QueryResult.failed("no references", remark=missing)
+        rig = matches.rig
+        all_matches, first_matches, start = self._first_pose(matches, references)
+        hypotheses = [] if start is None else self._hypotheses(rig, start, first_matches, all_matches, references)
         if hypotheses:
-            estimate = self._estimate(rig, matches, hypotheses, references)
+            result = self._estimate(rig, all_matches, hypotheses, references)
         else:
-            status = f"failed: {'no consistent pose' if len(np.unique(matches.point)) >= 4 else 'too few matches'}"
-            estimate = PoseEstimate(status, num_matches=len(matches), correspondences=self._rejected(matches))
+            reason = "no consistent pose" if len(np.unique(all_matches.point)) >= 4 else "too few matches"
+            rejected = self._rejected(all_matches)
+            result = QueryResult.failed(reason, num_matches=len(all_matches), correspondences=rejected)
         for prior in priors:
-            estimate = self._compare(rig, matches, hypotheses, estimate, references, prior)
-        return self._with_misfit(rig, matches, estimate)
+            result = self._compare(rig, all_matches, hypotheses, result, references, prior)
+        result = self._with_misfit(rig, all_matches, result)
+        partly = len(matches.usable) < len(matches.query.features)
+        return _of_all_images(matches, result, missing) if partly else result
 
-    def _localize_part(
-        self, query: Query, usable: Sequence[int], references: Sequence[References], priors: Sequence[Prior]
-    ) -> PoseEstimate:
-        """Return the estimate from the images with features alone; `usable` are their indices."""
-        missing = "; ".join(features for features in query.features if isinstance(features, str))
-        if not usable:
-            return PoseEstimate(f"failed: no readable image ({missing})")
-        estimate = self.localize(query.part(usable), [references[index] for index in usable], None, priors)
-        used = replace(estimate.correspondences, camera=np.array(usable, np.int64)[estimate.correspondences.camera])
-        focals_px = np.full(len(query.features), np.nan)
-        focals_px[usable] = estimate.focals_px or np.nan
-        centers_px = np.full((len(query.features), 2), np.nan)
-        centers_px[usable] = np.array(estimate.centers_px).reshape(-1, 2) if estimate.centers_px else np.nan
-        reason = "; ".join(filter(None, [estimate.reason, missing]))
-        centers = tuple((x, y) for x, y in centers_px.tolist())
-        focals = tuple(focals_px.tolist())
-        return replace(estimate, correspondences=used, focals_px=focals, centers_px=centers, reason=reason)
-
-    def _with_misfit(self, query: RigQuery, matches: Matches, estimate: PoseEstimate) -> PoseEstimate:
+    def _with_misfit(self, query: RigQuery, matches: Matches, estimate: QueryResult) -> QueryResult:
         """Return the estimate, with a warning if matches made without the pose contradict the query's intrinsics.
 
         The pose remains that of the stated intrinsics. Its covariance grows to cover the pose of those that would fit.
@@ -182,12 +189,13 @@ class PnpLocalizer(WithoutNetwork):
             return replace(estimate, covariance=wider, misfit=True)
         return replace(
             estimate,
-            status=CAMERA,
+            status=Status.LOW_CONFIDENCE,
+            reason=CAMERA,
             covariance=wider,
             misfit=True,
             focals_px=misfit.focals_px(query.cameras),
             centers_px=misfit.centers_px(query.cameras),
-            reason=misfit.reason(query.cameras),
+            remark=misfit.reason(query.cameras),
         )
 
     def _compare(
@@ -195,12 +203,12 @@ class PnpLocalizer(WithoutNetwork):
         query: RigQuery,
         matches: Matches,
         hypotheses: list[_Hypothesis],
-        estimate: PoseEstimate,
+        estimate: QueryResult,
         references: Sequence[References],
         prior: Prior,
-    ) -> PoseEstimate:
+    ) -> QueryResult:
         """Return the estimate found without a prior, or the one found from the prior if it is better supported."""
-        if estimate.status == "ok" and agree(estimate.world_from_rig, prior.world_from_rig):
+        if estimate.status is Status.OK and agree(estimate.world_from_rig, prior.world_from_rig):
             return estimate  # each confirms the other
         rig_from_world = geometry.invert(prior.world_from_rig)
         vicinity = self.matcher.vicinity(query, rig_from_world, self._covisible(prior.images), prior.radius_deg)
@@ -213,12 +221,12 @@ class PnpLocalizer(WithoutNetwork):
         support = hypotheses[0].support if hypotheses else 0.0
         clearly_more = support <= MAX_RIVAL_SUPPORT * hypothesis.support  # a tie keeps the first estimate
         as_much = hypothesis.support >= 0.99 * support  # found from two starts, one pose differs in the last digits
-        if (as_much and estimate.status != "ok") if same else clearly_more:
+        if (as_much and estimate.status is not Status.OK) if same else clearly_more:
             # The matches near the prior judge the pose: like matches by descriptors, they were made without it.
             prior_references = [References.of(prior.images.tolist())]
             with_prior = self._estimate(query, near, [hypothesis, *hypotheses], prior_references)
             lost = estimate.world_from_rig is None
-            if with_prior.world_from_rig is not None and (not same or lost or with_prior.status == "ok"):
+            if with_prior.world_from_rig is not None and (not same or lost or with_prior.status is Status.OK):
                 return replace(with_prior, found_by=f"pnp+{prior.source}")
             return estimate
         if same or estimate.world_from_rig is None:
@@ -232,10 +240,7 @@ class PnpLocalizer(WithoutNetwork):
         return self.matcher.covisible(np.unique(np.concatenate([np.zeros(0, np.int64), *points])))
 
     def _first_pose(
-        self,
-        query: RigQuery,
-        references: Sequence[References],
-        network_matches: Sequence[Sequence[NetworkMatches | None]],
+        self, of_query: PnpMatches, references: Sequence[References]
     ) -> tuple[Matches, Matches, Floats | None]:
         """Match the query by descriptors and find a first pose by RANSAC.
 
@@ -246,13 +251,13 @@ class PnpLocalizer(WithoutNetwork):
         Returns:
             All matches, the matches given to RANSAC, and the pose rig_from_world (4, 4), or None if there is none.
         """
-        settings, cache = self.settings, MatchCache()
+        settings, query = self.settings, of_query.rig
         start: Floats | None = None
         for count, enough in FIRST_REFERENCES.items():
             if all(len(retrieved.images) <= count for retrieved in references):
                 break
             best = [retrieved.take(np.arange(len(retrieved.images)) < count) for retrieved in references]
-            first_matches = self.matcher.by_descriptors(query, best, network_matches, cache)
+            first_matches = of_query.with_references(best)
             start = self._ransac(query, first_matches, settings.ransac_max_error_deg)
             none = np.zeros(len(first_matches), bool)
             inliers = first_matches[none if start is None else self._inliers(query, start, first_matches)]
@@ -265,7 +270,7 @@ class PnpLocalizer(WithoutNetwork):
                     for retrieved in references
                 ]
                 break
-        matches = self.matcher.by_descriptors(query, references, network_matches, cache)
+        matches = of_query.with_references(references)
         if start is not None:
             return matches, first_matches, start
         return matches, matches, self._ransac(query, matches, settings.ransac_max_error_deg)
@@ -350,7 +355,7 @@ class PnpLocalizer(WithoutNetwork):
 
     def _estimate(
         self, query: RigQuery, matches: Matches, hypotheses: list[_Hypothesis], references: Sequence[References]
-    ) -> PoseEstimate:
+    ) -> QueryResult:
         """Return the first hypothesis as an estimate, judged by the matches made without it and by its rivals.
 
         The other hypotheses must be sorted by support, best first.
@@ -360,8 +365,8 @@ class PnpLocalizer(WithoutNetwork):
         inliers = matches[self._inliers(query, rig_from_world, matches)]
         independent = self._independent(inliers)
         if independent < settings.min_inliers:
-            return PoseEstimate(
-                f"failed: too few inliers ({independent} within {settings.ransac_max_error_deg} deg)",
+            return QueryResult.failed(
+                f"too few inliers ({independent} within {settings.ransac_max_error_deg} deg)",
                 num_matches=len(matches),
                 num_inliers=independent,
                 correspondences=self._rejected(matches),
@@ -374,8 +379,8 @@ class PnpLocalizer(WithoutNetwork):
         images = np.unique(np.concatenate([retrieved.images for retrieved in references]))
         seen = self.map.images_seeing(np.unique(all_matches.point[agreeing]))[images]
         used = [int(images[index]) for index in np.argsort(-seen, kind="stable") if seen[index]]
-        estimate = PoseEstimate(
-            status="ok",
+        estimate = QueryResult(
+            Status.OK,
             world_from_rig=geometry.invert(rig_from_world),
             covariance=self._covariance(query, rig_from_world, guided, np.isin(guided.rows(), inliers.rows())),
             num_matches=len(matches),
@@ -386,7 +391,7 @@ class PnpLocalizer(WithoutNetwork):
             rivals=tuple(rivals),
             coverage=self._coverage(query, inliers),
             agreement=self._agreement(inliers),
-            references=tuple(used),
+            references=tuple(self.image_names[image] for image in used),
             correspondences=self._correspondences(all_matches, agreeing, len(guided), used),
         )
         evidence = {name: getattr(estimate, name) for name in EVIDENCE}
@@ -394,7 +399,7 @@ class PnpLocalizer(WithoutNetwork):
         probability = bounded_by_deviation(probability, estimate.position_std_m, estimate.rotation_std_deg)
         estimate = replace(estimate, p_correct=probability)
         certain = estimate.p_correct >= settings.ok_probability and estimate.rival_support <= MAX_RIVAL_SUPPORT
-        return estimate if certain else replace(estimate, status="low_confidence")
+        return estimate if certain else replace(estimate, status=Status.LOW_CONFIDENCE)
 
     def _agreement(self, inliers: Matches) -> int:
         """Return the number of inlier points of the kind of features that has the second most."""
@@ -477,3 +482,18 @@ class PnpLocalizer(WithoutNetwork):
 def _differ(hypothesis: _Hypothesis, other: _Hypothesis) -> bool:
     """Tell whether two hypotheses are clearly different poses: by more than half of what a right pose may be off."""
     return not agree(hypothesis.world_from_rig, other.world_from_rig, share=0.5)
+
+
+def _of_all_images(matches: PnpMatches, result: QueryResult, missing: str) -> QueryResult:
+    """Return a result that counts all images of the query, not only the usable ones; `missing` says why."""
+    used = np.array(matches.usable, np.int64)[result.correspondences.camera]
+    focals_px, centers_px = np.full(len(matches.query.views), np.nan), np.full((len(matches.query.views), 2), np.nan)
+    focals_px[matches.usable] = result.focals_px or np.nan
+    centers_px[matches.usable] = np.array(result.centers_px).reshape(-1, 2) if result.centers_px else np.nan
+    return replace(
+        result,
+        correspondences=replace(result.correspondences, camera=used),
+        focals_px=tuple(focals_px.tolist()),
+        centers_px=tuple((x, y) for x, y in centers_px.tolist()),
+        remark="; ".join(filter(None, [result.remark, missing])),
+    )

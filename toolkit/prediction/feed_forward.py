@@ -18,7 +18,8 @@ from toolkit.geometry import Floats, Ints
 from toolkit.manifest import PredictorSettings
 from toolkit.mapping.local_map import LocalMap
 from toolkit.models.compute import RUNNING
-from toolkit.pose.base import CAMERA, PoseEstimate, Prior, Query, QueryInput, References, View, carried_over
+from toolkit.pose.base import Localizer, Prior, Query, QueryInput, QueryMatches, References, View, carried_over
+from toolkit.pose.result import CAMERA, QueryResult, Status
 from toolkit.prediction.interface import Prediction, Predictor
 from toolkit.prediction.references import select_references
 from toolkit.threads import fixed_sums
@@ -46,7 +47,7 @@ class CameraAnswer:
     """(4, 4); None if the rotation is unknown. If the scale is unknown, the position is that of the first consistent
     reference."""
     covariance: Floats | None = None
-    """(6, 6), see `PoseEstimate.covariance`."""
+    """(6, 6), see `QueryResult.covariance`."""
     reason: str = ""
     """What was left out or is unknown; without a pose, why there is none."""
     depth_ratios: tuple[Floats, ...] = ()
@@ -69,7 +70,7 @@ class QueryPrediction:
 class FeedForwardAnswer:
     """The estimate for a query device, and the results per image that it combines."""
 
-    estimate: PoseEstimate
+    estimate: QueryResult
     cameras: tuple[CameraAnswer, ...] = ()
 
 
@@ -77,7 +78,7 @@ _Groups = tuple[list[list[Ints]], dict[tuple[int, int], list[View]]]
 """References chosen for each image of each query, and groups of views, keyed by query and image."""
 
 
-class FeedForwardLocalizer:
+class FeedForwardLocalizer(Localizer):
     """Localizes queries in one map by predicted cameras."""
 
     def __init__(
@@ -111,15 +112,11 @@ class FeedForwardLocalizer:
         self.image_names, self.batch_size = local_map.image_names, self.settings.batch_size
 
     @fixed_sums
-    def localize(
-        self,
-        query: Query,
-        references: Sequence[References],
-        prediction: QueryPrediction | None = None,
-        priors: Sequence[Prior] = (),
-    ) -> PoseEstimate:
+    def solve(
+        self, matches: QueryMatches, prediction: QueryPrediction | None = None, priors: Sequence[Prior] = ()
+    ) -> QueryResult:
         """Return the predicted pose of a query; see `Localizer`."""
-        return self.answer(query, references, prediction).estimate
+        return self.answer(matches.query, matches.references, prediction).estimate
 
     @fixed_sums
     def answer(
@@ -134,7 +131,7 @@ class FeedForwardLocalizer:
                 (prediction,) = self.predict([(query, references)])
         images = zip(query.views, prediction.references, prediction.predictions, strict=True)
         cameras = tuple(self._camera_answer(*image) for image in images)
-        return FeedForwardAnswer(_combine(query, cameras), cameras)
+        return FeedForwardAnswer(_combine(query, cameras, self.image_names), cameras)
 
     def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[QueryPrediction]:
         """Return the predictions for each query, made in one call of the predictor; see `Localizer`.
@@ -264,7 +261,7 @@ class FeedForwardLocalizer:
         return replace(seen, depth_m=seen.depth_m / self._length)
 
 
-def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
+def _combine(query: Query, cameras: tuple[CameraAnswer, ...], image_names: Sequence[str]) -> QueryResult:
     """Combine the poses of the cameras of a device into one estimate."""
     count = sum(len(answer.references) for answer in cameras if answer.prediction is not None)
     reasons = "; ".join(dict.fromkeys(answer.reason for answer in cameras if answer.reason))
@@ -272,7 +269,7 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
     poses = {index: answer.world_from_cam for index, answer in enumerate(cameras) if answer.world_from_cam is not None}
     covariances = {index: answer.covariance for index, answer in enumerate(cameras) if answer.covariance is not None}
     if not poses:
-        return PoseEstimate(f"failed: {reasons}", num_matches=count, found_by="feed_forward")
+        return QueryResult.failed(reasons, num_matches=count, found_by="feed_forward")
     known = [index for index in poses if np.isfinite(covariances[index]).all()]
     if known:
         mean = robust_mean_pose(
@@ -297,17 +294,18 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...]) -> PoseEstimate:
         reasons = "; ".join(filter(None, (reasons, f"the network sees a focal length of {seen} px")))
     consistent = [int(i) for index in kept for i in cameras[index].references[alignments[index].inliers]]
     shown = [int(i) for answer in cameras if answer.prediction is not None for i in answer.references]
-    return PoseEstimate(
-        status=CAMERA if misfit else "ok" if sure else "low_confidence",
+    return QueryResult(
+        Status.OK if sure and not misfit else Status.LOW_CONFIDENCE,
+        CAMERA if misfit else "",
         world_from_rig=pose,
         covariance=covariance,
         num_matches=count,
         num_inliers=len(consistent),
-        references=tuple(dict.fromkeys(consistent)),
+        references=tuple(image_names[index] for index in dict.fromkeys(consistent)),
         found_by="feed_forward",
         scale_std=min(alignments[index].scale_std for index in kept),
-        rejected=tuple(index for index in dict.fromkeys(shown) if index not in consistent),
-        reason=reasons,
+        rejected=tuple(image_names[index] for index in dict.fromkeys(shown) if index not in consistent),
+        remark=reasons,
         misfit=misfit,
         focals_px=focals if misfit else (),
     )

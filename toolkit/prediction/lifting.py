@@ -17,9 +17,10 @@ from toolkit.capture.depths import lifted
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import PnpSettings
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.base import PoseEstimate, Prior, Query, References
+from toolkit.pose.base import Prior, Query, References
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import GUIDED_WEIGHT, PnpLocalizer
+from toolkit.pose.result import QueryResult, Status
 from toolkit.pose.rig import Matches, RigQuery, least_squares_covariance
 from toolkit.prediction.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.threads import fixed_sums
@@ -68,7 +69,7 @@ class DepthLifter:
     @fixed_sums
     def localize(
         self, query: Query, references: Sequence[References], answer: FeedForwardAnswer, priors: Sequence[Prior] = ()
-    ) -> PoseEstimate | None:
+    ) -> QueryResult | None:
         """Return a pose from triangulated and lifted features of the references; None if none can be lifted.
 
         The pose is `ok` by the rules of `PnpLocalizer`. Its covariance includes the unknown depth scale of each image.
@@ -105,9 +106,9 @@ class DepthLifter:
             correspondences=replace(matched, point_index=whole_index[matched.point_index], found_by=found_by),
         )
         unmeasured = any(not depth.measured for depth in used)
-        if estimate.status == "ok" and unmeasured and not _consistent(estimate, answer.estimate):
+        if estimate.status is Status.OK and unmeasured and not _consistent(estimate, answer.estimate):
             why = "the predicted camera contradicts the pose that its depth gives"
-            return replace(estimate, status="low_confidence", reason=why)
+            return replace(estimate, status=Status.LOW_CONFIDENCE, remark=why)
         return estimate
 
     def lift(self, images: Sequence[int], answer: FeedForwardAnswer) -> LiftedMap | None:
@@ -237,7 +238,7 @@ def _predictions(answer: FeedForwardAnswer) -> dict[int, tuple[CameraAnswer, int
     return predictions
 
 
-def _consistent(estimate: PoseEstimate, predicted: PoseEstimate) -> bool:
+def _consistent(estimate: QueryResult, predicted: QueryResult) -> bool:
     """Tell whether a pose and the predicted one agree within their uncertainty; False if either is unknown."""
     poses = estimate.world_from_rig, predicted.world_from_rig
     covariances = estimate.covariance, predicted.covariance

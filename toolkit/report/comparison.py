@@ -5,7 +5,6 @@ Everything is read from the files of the runs; no query is localized again.
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -417,13 +416,13 @@ def _draw_query(comparison: Comparison, query: Mapping[str, Any], run: str) -> "
     manifest, files = comparison.records[i]["manifest"], SceneFiles(comparison.folders[i], query["scene"])
     with extra_devices(manifest.get("extra_devices", [])), allow_outside(manifest.get("allow_outside", False)):
         pair = InspectedPair(query["map_device"], query["query_device"], files.poses_dir).localized
-        with closing(pair.queries):
-            same = (pair.table["timestamp"] == query["timestamp"]) & (pair.table["device_id"] == query["device_id"])
-            if not same.any():
-                raise ArtifactError(f"{files.poses_dir / pair.name}.csv: no row of query {query['timestamp']}.")
-            k = int(np.flatnonzero(same)[0])
-            title = f"{run}: {pair.table['status'].iloc[k]}"
-            return title, draw_localization(pair.details(k), title=title, unit=pair.unit)
+        table = pair.results.table
+        same = (table["timestamp"] == query["timestamp"]) & (table["device_id"] == query["device_id"])
+        if not same.any():
+            raise ArtifactError(f"{files.poses_dir / pair.name}.csv: no row of query {query['timestamp']}.")
+        k = int(np.flatnonzero(same)[0])
+        title = f"{run}: {table['status'].iloc[k]}"
+        return title, draw_localization(pair.details(k), title=title, unit=pair.results.unit)
 
 
 def _name(change: Mapping[str, Any]) -> str:

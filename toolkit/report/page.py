@@ -24,12 +24,12 @@ from toolkit.files import (
     SceneFiles,
     of_sequence,
     older_files,
-    pair_devices,
     read_json,
     read_map_record,
     sidecar_path,
     write_text,
 )
+from toolkit.pose.result import Status, status_counts, statuses
 from toolkit.results.metrics import (
     REASONS,
     THRESHOLDS,
@@ -42,6 +42,7 @@ from toolkit.results.metrics import (
     unit_of,
     worst_first,
 )
+from toolkit.results.pair import PairResults, pairs_of
 
 Write = Callable[[Any], str]
 """Function that writes a number of a table."""
@@ -236,7 +237,7 @@ def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any
         for name in tables
     )
     thresholds = [column for column in recall.columns if column.startswith("recall@")]
-    statuses = _read_statuses(files, messages)
+    queries = _read_statuses(files, messages)
     messages += [f"Not shown: {why}" for why in dict.fromkeys(older.values())]
     if older_pictures:
         first = next(iter(older_pictures.values()))
@@ -257,7 +258,7 @@ def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any
     if unit != "m":
         depth = f"a tenth of the median scene depth of a map{': ' if lengths else ''}{', '.join(lengths)}"
         remarks.append(f"The unit of the poses is not known: {unit} is {depth}.")
-    verdict, headlines = _verdict(recall, errors, statuses, thresholds)
+    verdict, headlines = _verdict(recall, errors, queries, thresholds)
     matrices, note = _retrieval(retrieval, headlines, unit)
     stills = sorted((path for path in files.visualization.glob("*.png") if path.name not in older), key=_natural)
     worst = [path for path in stills if path.name.startswith("worst")]
@@ -283,8 +284,8 @@ def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any
         "pairs": _pairs(recall, thresholds),
         "losses": _losses(losses),
         "missed": int(losses["missed"].sum()) if "missed" in losses else 0,
-        "failures": _failures(statuses),
-        "worst": _worst(errors if len(errors) else statuses, thresholds),
+        "failures": _failures(queries),
+        "worst": _worst(errors if len(errors) else queries, thresholds),
         "retrieval": matrices,
         "retrieval_note": note,
         # Pictures of failures come first, while there is room: they are the hardest to understand from tables alone.
@@ -315,27 +316,28 @@ def _read_table(path: Path, messages: list[str]) -> pd.DataFrame:
 def _read_statuses(files: SceneFiles, messages: list[str]) -> pd.DataFrame:
     """Return `STATUS_COLUMNS` of every query of every pair, with or without ground truth."""
     tables = []
-    for path in sorted(files.poses_dir.glob("*.csv")):
-        map_device, query_device = pair_devices(path.stem)
-        if map_device and query_device and not of_sequence(path.stem):
-            table = _read_table(path, messages)
-            if "status" in table:
-                table = table.reindex(columns=STATUS_COLUMNS)
-                tables.append(table.assign(map_device=map_device, query_device=query_device))
+    for path in pairs_of(files.poses_dir):
+        try:
+            results = PairResults.open(path)
+        except ArtifactError as error:
+            messages.append(str(error))
+            continue
+        table, devices = results.table.reindex(columns=STATUS_COLUMNS), results.devices
+        tables.append(table.assign(map_device=devices[0], query_device=devices[1]))
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
 def _verdict(
-    recall: pd.DataFrame, errors: pd.DataFrame, statuses: pd.DataFrame, thresholds: list[str]
+    recall: pd.DataFrame, errors: pd.DataFrame, queries: pd.DataFrame, thresholds: list[str]
 ) -> tuple[list[str], list[tuple[str, str]]]:
     """Summarize the quality of the poses in sentences, and in headlines: a number and its meaning."""
     verdict, headlines = list[str](), list[tuple[str, str]]()
-    if len(statuses):
-        pairs = len(statuses[["map_device", "query_device"]].drop_duplicates())
-        counts = statuses["status"].str.split(":").str[0].value_counts()
-        parts = ", ".join(f"{counts.get(s, 0)} {s.replace('_', ' ')}" for s in ("ok", "low_confidence", "failed"))
-        verdict.append(f"{len(statuses)} queries in {pairs} pair{'s' * (pairs != 1)} of devices: {parts}.")
-        verdict += _escalation(statuses)
+    if len(queries):
+        pairs = len(queries[["map_device", "query_device"]].drop_duplicates())
+        counts = status_counts(queries["status"])
+        parts = ", ".join(f"{count} {status.replace('_', ' ')}" for status, count in counts.items())
+        verdict.append(f"{len(queries)} queries in {pairs} pair{'s' * (pairs != 1)} of devices: {parts}.")
+        verdict += _escalation(queries)
     done = recall.dropna(subset=thresholds) if thresholds else recall.iloc[:0]
     if not len(done):
         return verdict, headlines
@@ -360,13 +362,14 @@ def _verdict(
     return verdict, headlines
 
 
-def _escalation(statuses: pd.DataFrame) -> list[str]:
+def _escalation(queries: pd.DataFrame) -> list[str]:
     """Say in a sentence what escalation to further kinds of features gained and cost; empty without escalation."""
-    escalated = statuses[statuses["first_status"].notna()]
+    escalated = queries[queries["first_status"].notna()]
     if not len(escalated):
         return []
     ok = (escalated["status"] == "ok").sum()
-    posed = (escalated["first_status"].str.startswith("failed") & ~escalated["status"].str.startswith("failed")).sum()
+    before, after = (statuses(escalated[name]) == Status.FAILED for name in ("first_status", "status"))
+    posed = (before & ~after).sum()
     seconds = (escalated["seconds"] - escalated["first_seconds"]).sum()
     gained = f", {posed} without a pose got one" if posed else ""
     return [
@@ -480,9 +483,9 @@ def _losses(losses: pd.DataFrame) -> Markup:
     return _table(table, caption, dict.fromkeys(REASONS, _share))
 
 
-def _failures(statuses: pd.DataFrame) -> Markup:
+def _failures(queries: pd.DataFrame) -> Markup:
     """Count the queries without a pose by reason."""
-    failed = statuses[statuses["status"].str.startswith("failed")] if len(statuses) else statuses
+    failed = queries[statuses(queries["status"]) == Status.FAILED] if len(queries) else queries
     if not len(failed):
         return Markup()
     # Drop details in parentheses: they differ from query to query for the same reason.

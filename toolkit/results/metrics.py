@@ -9,6 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from toolkit.geometry import Floats, Ints, pose_error
+from toolkit.pose.result import Status, statuses
 
 if TYPE_CHECKING:
     from toolkit.capture import Session, Trajectory
@@ -139,8 +140,8 @@ def worst_first(queries: pd.DataFrame, threshold: Threshold = THRESHOLDS[0]) -> 
         values = np.asarray(values, np.float64)
         return np.where(np.isnan(values), unknown, values)
 
-    ok = ~queries["status"].str.startswith("failed").to_numpy(bool)
-    sure = ~queries["status"].str.startswith("low_confidence").to_numpy(bool)
+    status = statuses(queries["status"])
+    ok, sure = (status != Status.FAILED).to_numpy(bool), (status != Status.LOW_CONFIDENCE).to_numpy(bool)
     rotation, translation = column("rotation_error_deg", -1) / threshold[0], column("translation_error_m", -1)
     error = np.maximum(rotation, translation / threshold[1])
     # lexsort: the last key is the primary one.
@@ -162,14 +163,15 @@ def camera_messages(session: "Session", tables: Sequence[pd.DataFrame]) -> list[
     sensors = session.images["sensor_id"].to_numpy()
     for table in tables:
         texts = {name: _texts(table, name) for name in ("focal_px", "principal_point_px")}
-        statuses = table["status"].fillna("failed")
-        for number, (images, status) in enumerate(zip(session.rows_of_keyframes(table), statuses, strict=True)):
-            if status.startswith("failed"):
+        texts_of_status = table["status"].fillna(Status.FAILED)
+        for number, (images, text) in enumerate(zip(session.rows_of_keyframes(table), texts_of_status, strict=True)):
+            status, reason = Status.parse(text)
+            if status is Status.FAILED:
                 continue
             names = [re.sub(r"[_-]\d{6,}$", "", sensor_id) for sensor_id in sensors[images]]
             for name in names:
                 posed[name] = posed.get(name, 0) + 1
-            for column, of_queries in texts.items() if status.startswith("low_confidence: ") else ():
+            for column, of_queries in texts.items() if status is Status.LOW_CONFIDENCE and reason else ():
                 values = of_queries[number].split(";")
                 for name, sensor_id, value in zip(names, sensors[images], values, strict=False):
                     if value:

@@ -1,32 +1,188 @@
-"""Read the stored results of the localize stage: poses, errors and correspondences of a pair's queries."""
+"""The one reader of the localize stage's results for a pair of devices: poses, table and correspondences.
 
-from collections.abc import Sequence
-from contextlib import closing, suppress
-from dataclasses import dataclass, field, replace
+The group `<timestamp>/<device_id>` of a query in `poses/<pair>.h5` holds the arrays of `QueryResult.arrays`. Figures,
+exports and evaluations read this file, so they use exactly the correspondences of the localization.
+"""
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
+import h5py
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-from toolkit import geometry
-from toolkit.capture import Capture, Session, Trajectory
+from toolkit.capture import Trajectory
 from toolkit.capture.tables import read_query_table
-from toolkit.errors import ArtifactError
-from toolkit.files import map_record_path, pair_name, read_map_record, require_whole
-from toolkit.geometry import Floats, Ints, invert
+from toolkit.errors import ArtifactError, DamagedError, first_line
+from toolkit.files import (
+    map_record_path,
+    of_sequence,
+    pair_devices,
+    pair_name,
+    read_map_record,
+    require_current,
+    require_whole,
+)  # fmt: skip
+from toolkit.geometry import Floats
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.correspondences import Correspondences, LocalizedQueries, LocalizedQuery
-from toolkit.results.metrics import is_posed, length_unit, pose_errors, worst_first
+from toolkit.pose.result import QueryResult, Status, statuses
+from toolkit.results.metrics import is_posed, length_unit, pose_errors
+from toolkit.store.hdf5 import HDF5_ERRORS, has_group, read_group
 
-if TYPE_CHECKING:
-    import pycolmap
+MAPS = "maps"
+"""Attribute of `poses/<pair>.h5`: names of the triangulated maps in the folder of maps, one per kind of features."""
 
 
-REFERENCES = 4
-"""References shown per query, at most."""
+def query_group(timestamp: int, device_id: str) -> str:
+    """Return the name of a query's group. A `/` in a device id is written as `%2F`, as it would add a level."""
+    return f"{timestamp}/{device_id.replace('%', '%25').replace('/', '%2F')}"
+
+
+@dataclass(frozen=True, eq=False)
+class PairResults:
+    """The stored results of the Q queries of a pair, in the order of its table; poses are read when they are needed."""
+
+    path: Path
+    """`poses/<pair>.txt`."""
+    table: pd.DataFrame
+    """`poses/<pair>.csv`: one row per query, `status` as text. Lengths are in the unit of the poses."""
+
+    @classmethod
+    def open(cls, path: str | Path) -> "PairResults":
+        """Open a pair's results, given any file of it: `poses/<pair>.txt`, `.csv` or `.h5`.
+
+        If there is no table, because another tool computed the poses, every pose counts as `ok`.
+
+        Raises:
+            ArtifactError: a file is missing or torn.
+        """
+        poses, csv = Path(path).with_suffix(".txt"), Path(path).with_suffix(".csv")
+        require_whole(poses)  # in a truncated file, missing queries would look like queries without a pose
+        require_whole(csv, of=poses)
+        if csv.is_file() or not poses.is_file():
+            return cls(poses, read_query_table(csv, ["status"]))
+        read = Trajectory.read(poses)
+        keys = {"timestamp": read.timestamps, "device_id": np.asarray(read.device_ids, object)}
+        return cls(poses, pd.DataFrame({**keys, "status": str(Status.OK)}))
+
+    @classmethod
+    def of(cls, poses_dir: str | Path, scene: str, map_device: str, query_device: str) -> "PairResults":
+        """Open the results of a pair in a folder of poses; see `open`."""
+        return cls.open(Path(poses_dir) / f"{pair_name(scene, map_device, query_device)}.txt")
+
+    @property
+    def devices(self) -> tuple[str, str]:
+        """Map device and query device."""
+        return pair_devices(self.path.stem)
+
+    @property
+    def h5(self) -> Path:
+        return self.path.with_suffix(".h5")
+
+    @property
+    def status(self) -> pd.Series:
+        """Status of each query without its reason: `ok`, `low_confidence`, `failed`."""
+        return statuses(self.table["status"])
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        return Trajectory.read(self.path)
+
+    @cached_property
+    def poses(self) -> Floats:
+        """world_from_rig (Q, 4, 4), NaN without a pose; for a single camera, the rig is the camera."""
+        return self.trajectory.lookup(self.table["timestamp"].to_numpy(), self.table["device_id"])
+
+    @cached_property
+    def covariances(self) -> Floats:
+        """(Q, 6, 6), see `QueryResult.covariance`; NaN if unknown."""
+        at = self.trajectory.index.find(self.table["timestamp"].to_numpy(), self.table["device_id"].to_numpy(str))
+        covariances = np.full((len(self), 6, 6), np.nan)
+        if self.trajectory.covariances is not None:
+            covariances[at >= 0] = self.trajectory.covariances[at[at >= 0]]
+        return covariances
+
+    @cached_property
+    def unit(self) -> tuple[str, float]:
+        """The unit that lengths are shown in, see `metrics.length_unit`."""
+        scene = self.path.stem.rpartition("_map_")[0]
+        return length_unit(read_map_record(map_record_path(self.path.parent, scene, self.devices[0])))
+
+    @cached_property
+    def _file(self) -> h5py.File:
+        try:
+            return h5py.File(self.h5, "r")
+        except HDF5_ERRORS as error:
+            raise ArtifactError(
+                f"{self.h5}: the correspondences of the poses cannot be read ({error}). Localize again."
+            ) from None
+
+    @cached_property
+    def maps(self) -> list[str]:
+        """Names of the triangulated maps that `Correspondences.point_index` counts through."""
+        try:
+            return list(json.loads(self._file.attrs.get(MAPS, "[]")))
+        except HDF5_ERRORS as error:
+            raise ArtifactError(f"{self.h5}: its maps cannot be read ({error}). Localize again.") from None
+
+    def local_map(self, map_dir: str | Path | None) -> LocalMap | None:
+        """Return the triangulated maps of these poses pooled into one; None if none of them can be read."""
+        return load_maps(map_files(map_dir, f"{self.devices[0]}_map", self.h5))
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def __iter__(self) -> Iterator[QueryResult]:
+        return (self[number] for number in range(len(self)))
+
+    def __getitem__(self, number: int) -> QueryResult:
+        """Return the result of a query by its number in the table.
+
+        Raises:
+            ArtifactError: its correspondences are damaged (DamagedError) or cannot be read.
+        """
+        row: dict[str, Any] = self.table.iloc[number].to_dict()
+        pose, covariance = self.poses[number], self.covariances[number]
+        return replace(
+            self._stored(int(row["timestamp"]), str(row["device_id"])).with_row(row),
+            world_from_rig=pose if is_posed(pose) else None,
+            covariance=None if np.isnan(covariance).all() else covariance,
+        )
+
+    def _stored(self, timestamp: int, device_id: str) -> QueryResult:
+        """Return the arrays of a query; empty if the stage could not process it."""
+        name = query_group(timestamp, device_id)
+        if not has_group(self._file, name):
+            return QueryResult(Status.FAILED)
+        try:
+            return QueryResult.from_arrays(read_group(self._file, name))
+        except (*HDF5_ERRORS, AttributeError) as error:
+            raise DamagedError(
+                self.h5, f"{self.h5}: {name} is not as a run writes it ({first_line(error)}). Localize again."
+            ) from None
+
+    def errors(self, truth: Trajectory | Floats) -> pd.DataFrame:
+        """Return the table with `rotation_error_deg` and `translation_error_m`, by `metrics.pose_errors`.
+
+        Args:
+            truth: true world_from_rig: a trajectory, or (Q, 4, 4).
+
+        Errors are infinite without a pose and NaN without a true pose. Lengths, `position_std_m` too, are in `unit`.
+        """
+        keys = self.table[["timestamp", "device_id"]]
+        rotation_deg, translation = pose_errors(self.poses, truth, keys) if len(self) else (np.zeros(0), np.zeros(0))
+        table = self.table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation)
+        lengths = table.columns.intersection(["translation_error_m", "position_std_m"])
+        return table.assign(**table[lengths] / self.unit[1])
+
+    def require_current(self, *endings: str) -> None:
+        """Raise ArtifactError if the poses were made from other files than those that are there now."""
+        require_current(self.path, "localize", endings, missing=False)
 
 
 def map_files(map_dir: str | Path | None, session_id: str, h5: Path | None = None) -> tuple[Path, ...]:
@@ -40,10 +196,7 @@ def map_files(map_dir: str | Path | None, session_id: str, h5: Path | None = Non
     """
     if map_dir is None:
         return ()
-    names = list[str]()
-    if h5 is not None and h5.is_file():
-        with closing(LocalizedQueries(h5)) as queries:
-            names = queries.maps
+    names = PairResults(h5, pd.DataFrame()).maps if h5 is not None and h5.is_file() else []
     paths = [Path(map_dir) / name for name in names] or sorted(Path(map_dir).glob(f"{session_id}*.npz"))
     return tuple(path for path in paths if path.is_file())
 
@@ -57,263 +210,7 @@ def load_maps(paths: Sequence[Path]) -> LocalMap | None:
     return LocalMap.pooled(maps) if maps else None
 
 
-MAX_POINTS = 1_000_000
-"""Points of a map that are shown, at most: a viewer needs about 30 bytes for each."""
-
-
-def sure_points(local_map: LocalMap | None) -> tuple[Floats, NDArray[np.uint8] | None]:
-    """Return the points seen by at least three images, (P, 3), and their colors (P, 3) RGB; other points are noisy.
-
-    A large map is reduced to a regular sample of at most `MAX_POINTS`.
-    """
-    if local_map is None:
-        return np.zeros((0, 3)), None
-    sure = np.flatnonzero(np.diff(local_map.point_starts) >= 3)
-    sure = sure[:: -(-len(sure) // MAX_POINTS) or 1]
-    return local_map.points[sure], local_map.colors[sure]
-
-
-@dataclass(frozen=True)
-class ShownImage:
-    """A posed image and its correspondences."""
-
-    name: str
-    path: Path
-    camera: "pycolmap.Camera"
-    world_from_cam: Floats
-    """(4, 4); NaN if unknown."""
-    pixels: Floats = field(default_factory=lambda: np.zeros((0, 2)))
-    """(n, 2) measured keypoints, pixels of the full image."""
-    points: Floats = field(default_factory=lambda: np.zeros((0, 3)))
-    """(n, 3) map points, world, meters."""
-    matches: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    """(n,) numbers of the correspondences; pixels with the same number in two images match."""
-    inlier: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
-    """(n,) whether each correspondence agrees with the pose."""
-    world_from_cam_true: Floats = field(default_factory=lambda: np.full((4, 4), np.nan))
-    """(4, 4); NaN if unknown."""
-    found_by: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, np.str_))
-    """(n,) how each correspondence was found, such as `sift/guided`."""
-
-    @property
-    def num_inliers(self) -> int:
-        return int(self.inlier.sum())
-
-    def shifted(self, offset: Floats) -> "ShownImage":
-        """Return the image in a world whose origin is shifted: `offset` (3,) is added to all positions."""
-        return replace(
-            self,
-            points=self.points + offset,
-            world_from_cam=geometry.shifted(self.world_from_cam, offset),
-            world_from_cam_true=geometry.shifted(self.world_from_cam_true, offset),
-        )
-
-
-_OF_A_MATCH = ("pixels", "points", "matches", "inlier", "found_by")
-
-
-@dataclass(frozen=True)
-class QueryDetails:
-    """Images and correspondences of one query."""
-
-    cameras: Sequence[ShownImage]
-    """Its images, at the estimated pose; the one with the most points that agree first."""
-    references: Sequence[ShownImage] = ()
-    """Map images that it was localized with, best first."""
-    rejected: Sequence[ShownImage] = ()
-    """References that contradict the references used."""
-
-    @property
-    def has_matches(self) -> bool:
-        """Whether the method matched keypoints, rather than used the poses of whole references."""
-        return any(len(camera.matches) for camera in self.cameras)
-
-    def shifted(self, offset: Floats) -> "QueryDetails":
-        """Return the images in a world whose origin is shifted, see `ShownImage.shifted`."""
-        groups = (self.cameras, self.references, self.rejected)
-        return QueryDetails(*([image.shifted(offset) for image in images] for images in groups))
-
-    def of_first_camera(self) -> "QueryDetails":
-        """Return the first image alone, and references with only its correspondences."""
-
-        def reduced(image: ShownImage) -> ShownImage:
-            chosen = np.isin(image.matches, self.cameras[0].matches)
-            return replace(image, **{name: getattr(image, name)[chosen] for name in _OF_A_MATCH})
-
-        return QueryDetails(self.cameras[:1], list(map(reduced, self.references)), self.rejected)
-
-    def captioned_references(self) -> list[tuple[ShownImage, str, bool]]:
-        """Return at most `REFERENCES` references, up to two of them rejected: image, caption, whether used."""
-        agree = [
-            (image, f"reference {rank}" + (f": sees {image.num_inliers} points" if self.has_matches else ""), True)
-            for rank, image in enumerate(self.references, start=1)
-        ]
-        rejected = [(image, "rejected: contradicts the others", False) for image in self.rejected]
-        return [*agree[: REFERENCES - min(2, len(rejected))], *rejected][:REFERENCES]
-
-
-def support_of(row: pd.Series) -> str:
-    """Return the support of the pose in a row of a pair's csv as text, such as `120 inliers`."""
-    # Older runs name the method `vggt`.
-    by_network = str(row.get("method", "")).rpartition("/")[2].startswith(("feed_forward", "vggt"))
-    return f"{row['num_inliers']:.0f} {'consistent references' if by_network else 'inliers'}"
-
-
-@dataclass(frozen=True)
-class Localizations:
-    """The queries of a pair, one row each; a rig is represented by its first image."""
-
-    names: Sequence[str]
-    table: pd.DataFrame
-    """The pair's csv, with at least the columns status and num_inliers."""
-    estimated: Floats
-    """world_from_cam (Q, 4, 4), NaN without a pose."""
-    true: Floats
-    """True world_from_cam (Q, 4, 4), NaN where unknown."""
-    nearest_reference: Floats = field(default_factory=lambda: np.zeros((0, 3)))
-    """World position (Q, 3) of the first reference of each query without a pose; else NaN."""
-    unit: tuple[str, float] = ("m", 1.0)
-    """Unit that lengths are shown in, see `metrics.length_unit`."""
-    cam_from_rig: Floats = field(default_factory=lambda: np.eye(4))
-    """(Q, 4, 4), or one (4, 4) for all."""
-
-    def shifted(self, offset: Floats) -> "Localizations":
-        """Return the queries in a world whose origin is shifted, see `ShownImage.shifted`."""
-        return replace(
-            self,
-            estimated=geometry.shifted(self.estimated, offset),
-            true=geometry.shifted(self.true, offset),
-            nearest_reference=self.nearest_reference + offset,
-        )
-
-    @cached_property
-    def ranked(self) -> pd.DataFrame:
-        """The table with the errors of the device: `rotation_error_deg`, and `translation_error_m`.
-
-        They equal those of the evaluation: infinite without a pose, NaN without ground truth. Lengths are in `unit`.
-        """
-        rotation_deg, translation = pose_errors(self.estimated @ self.cam_from_rig, self.true @ self.cam_from_rig)
-        table = self.table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation)
-        lengths = table.columns.intersection(["translation_error_m", "position_std_m"])
-        return table.assign(**table[lengths] / self.unit[1])
-
-    def worst_first(self) -> Ints:
-        """Return the rows from worst to best (`metrics.worst_first`)."""
-        return worst_first(self.ranked)
-
-
-@dataclass
-class LocalizedPair:
-    """The queries of a pair in their map. Images and correspondences of a query are read on demand."""
-
-    name: str
-    map_session: Session
-    query_session: Session
-    table: pd.DataFrame
-    """The pair's csv: one row per query with an image."""
-    rows: list[Ints]
-    """For each query, the rows of its images in the session."""
-    world_from_rig: Floats
-    """(Q, 4, 4), NaN without a pose."""
-    queries: LocalizedQueries
-    local_map: LocalMap | None
-    """The triangulated maps that the run used, pooled."""
-    unit: tuple[str, float] = ("m", 1.0)
-    """Unit that lengths are shown in, see `metrics.length_unit`."""
-
-    @classmethod
-    def open(
-        cls, capture: Capture, map_device: str, query_device: str, poses_dir: str | Path, map_dir: str | Path | None
-    ) -> "LocalizedPair":
-        """Read the stored results of the localize stage for a pair.
-
-        Raises:
-            ArtifactError: the poses, their table or their correspondences are missing or torn.
-        """
-        name = pair_name(capture.name, map_device, query_device)
-        session, stem = capture[f"{query_device}_query"], Path(poses_dir) / name
-        poses_path, table_path = Path(f"{stem}.txt"), Path(f"{stem}.csv")
-        require_whole(poses_path)  # in a truncated file, missing queries would look like queries without a pose
-        require_whole(table_path, of=poses_path)
-        table = read_query_table(table_path, ["status"])
-        rows = session.rows_of_keyframes(table)
-        has_image = np.array([len(images) > 0 for images in rows], bool)
-        table, rows = table[has_image].reset_index(drop=True), [images for images in rows if len(images)]
-        poses = Trajectory.read(poses_path).lookup(table["timestamp"].to_numpy(), table["device_id"])
-        h5 = Path(f"{stem}.h5")
-        local_map, queries = load_maps(map_files(map_dir, f"{map_device}_map", h5)), LocalizedQueries(h5)
-        unit = length_unit(read_map_record(map_record_path(poses_dir, capture.name, map_device)))
-        return cls(name, capture[f"{map_device}_map"], session, table, rows, poses, queries, local_map, unit)
-
-    def localized(self, k: int) -> LocalizedQuery:
-        """Return the references and correspondences of query k; empty if the stage could not process it."""
-        key = int(self.table["timestamp"].iloc[k]), str(self.table["device_id"].iloc[k])
-        return self.queries.get(key, LocalizedQuery())
-
-    @cached_property
-    def localizations(self) -> Localizations:
-        session = self.query_session
-        first = np.array([rows[0] for rows in self.rows], np.int64)
-        rig_from_cam = session.rig_from_cam(first)
-        estimated = self.world_from_rig @ rig_from_cam
-        centers = np.full((len(first), 3), np.nan)
-        for k in np.flatnonzero(~is_posed(estimated)):
-            names = [name for name in self.localized(int(k)).references if name in self.map_session.row_of_name]
-            if names:
-                centers[k] = self.map_session.world_from_cam([self.map_session.row_of_name[names[0]]])[0, :3, 3]
-        names = [session.image_name(int(row)) for row in first]
-        true = session.world_from_cam(first, ground_truth=True)
-        return Localizations(names, self.table, estimated, true, centers, self.unit, invert(rig_from_cam))
-
-    def details(
-        self, k: int, query: LocalizedQuery | None = None, world_from_rig: Floats | None = None
-    ) -> QueryDetails:
-        """Return images, correspondences and references of query k.
-
-        Args:
-            query, world_from_rig: another result for the query, and its pose (4, 4); None: the stored ones.
-        """
-        session, rows = self.query_session, self.rows[k]
-        query = self.localized(k) if query is None else query
-        poses = (self.world_from_rig[k] if world_from_rig is None else world_from_rig) @ session.rig_from_cam(rows)
-        cameras = []
-        for row, pose in zip(rows.tolist(), poses, strict=True):
-            name = session.image_name(row)
-            matches = query.correspondences.in_camera(query.images.index(name) if name in query.images else -1)
-            pixels = query.correspondences.pixels[matches]
-            cameras.append(_shown_image(session, row, pose, query.correspondences, matches, pixels))
-        cameras.sort(key=lambda camera: -camera.num_inliers)
-        return QueryDetails(
-            cameras,
-            self._references(query, list(enumerate(query.references))),
-            self._references(query, [(-1, name) for name in query.rejected]),
-        )
-
-    def _references(self, query: LocalizedQuery, names: Sequence[tuple[int, str]]) -> list[ShownImage]:
-        """Return the first few map images with their correspondences; `names` are (reference number, image name)."""
-        session, correspondences = self.map_session, query.correspondences
-        numbered_rows = [(number, session.row_of_name[name]) for number, name in names if name in session.row_of_name]
-        poses = session.world_from_cam([row for _, row in numbered_rows[:REFERENCES]])
-        images = []
-        for (number, row), pose in zip(numbered_rows, poses, strict=False):
-            views = np.flatnonzero(correspondences.view_reference == number)
-            matches, pixels = correspondences.view_of[views], correspondences.view_pixels[views]
-            images.append(_shown_image(session, row, pose, correspondences, matches, pixels))
-        return images
-
-
-def _shown_image(
-    session: Session, row: int, pose: Floats, correspondences: Correspondences, matches: Ints, pixels: Floats
-) -> ShownImage:
-    return ShownImage(
-        session.image_name(row),
-        session.image_path(row),
-        session.camera(str(session.images["sensor_id"].iloc[row])),
-        pose,
-        pixels,
-        correspondences.points[matches],
-        matches,
-        correspondences.inlier[matches],
-        session.world_from_cam([row], ground_truth=True)[0],
-        correspondences.found_by[matches],
-    )
+def pairs_of(poses_dir: str | Path) -> list[Path]:
+    """Return the tables of all pairs in a folder of poses, `<pair>.csv`."""
+    tables = sorted(Path(poses_dir).glob("*_map_*_query_*.csv"))
+    return [path for path in tables if all(pair_devices(path.stem)) and not of_sequence(path.stem)]

@@ -1,6 +1,6 @@
 """A finished run in the hand: its maps, and the way of an image through them."""
 
-from toolkit.scene.map import Map, create_localizer
+from toolkit.scene.map import Map, localize_image
 from toolkit.scene.run import Run
 
-__all__ = ["Map", "Run", "create_localizer"]
+__all__ = ["Map", "Run", "localize_image"]

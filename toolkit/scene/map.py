@@ -1,75 +1,81 @@
-"""The map of one device: its features, its triangulated points, and its localizer."""
+"""The map of one device, and the way of an image through it: query, describe, retrieve, match, solve, locate."""
 
-import json
+import copy
 import logging
-import shutil
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-import h5py
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from toolkit import geometry
 from toolkit.capture import Capture, Session, masks
 from toolkit.capture.upright import Turns, upright_turns
-from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_folders, open_descriptors, shows_upright
-from toolkit.embedders.index import JoinedIndex, VectorIndex, load_index
-from toolkit.embedders.search import search
-from toolkit.embedders.stored import embedder_fingerprint
-from toolkit.errors import ArtifactError, ManifestError, ToolkitError
-from toolkit.features.features import KINDS, extract_turned
+from toolkit.errors import ArtifactError, ManifestError
+from toolkit.features.features import KINDS
 from toolkit.features.matching import AnyMethod, DeferredMethod, LocalMethod, create_local_methods, weights_files
 from toolkit.features.stores import FeatureStore, OnDemandFeatures, extract_session
-from toolkit.features.verification import Verifier
-from toolkit.files import (
-    SceneFiles,
-    file_fingerprint,
-    fingerprint,
-    image_name,
-    pair_devices,
-    require_current,
-    write_atomic,
-)  # fmt: skip
-from toolkit.geometry import Floats, Ints, unit
-from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings, Settings, nearest
+from toolkit.files import SceneFiles, fingerprint, require_current
+from toolkit.geometry import Floats, Ints
+from toolkit.manifest import LocalizeSettings
 from toolkit.mapping.build import build_map
 from toolkit.mapping.local_map import Consistency, LocalMap, map_path
 from toolkit.mapping.pose_consistency import NOMINAL_DEPTH, USUAL_DEPTHS_M
-from toolkit.pose.base import Localizer, PoseEstimate, References, RoughPose, ScaledLocalizer
-from toolkit.pose.correspondences import MAPS
-from toolkit.pose.escalation import SURE_POSITION_STD_M, EscalatingLocalizer
+from toolkit.pose.base import (
+    SEARCH_DEG,
+    Localizer,
+    Prior,
+    Query,
+    QueryInput,
+    QueryMatches,
+    References,
+    RoughPose,
+)  # fmt: skip
 from toolkit.pose.local_triangulation import OnDemandLocalizer, PosedImages
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.nearest import NearestLocalizer
 from toolkit.pose.pnp import PnpLocalizer
+from toolkit.pose.result import QueryResult, Status
 from toolkit.prediction.feed_forward import FeedForwardLocalizer
 from toolkit.prediction.hybrid import HybridLocalizer
 from toolkit.prediction.interface import Predictor
 from toolkit.prediction.registry import open_predictor
-from toolkit.runs.record import RECORD
-from toolkit.store.hdf5 import HDF5_ERRORS
+from toolkit.scene.opening import (
+    RETRIEVAL,
+    SESSIONS_ROOT,
+    Localized,
+    how_localized,
+    last_localized,
+    session_fingerprint,
+    unknown,
+)  # fmt: skip
+from toolkit.scene.query import Image, query_from
+from toolkit.scene.search import ReferenceSearch
+from toolkit.threads import fixed_sums
 
 log = logging.getLogger(__name__)
 
-SETTINGS = "settings"
-SESSIONS_ROOT = "sessions_root"
+WITHOUT_FEATURES = ("feed_forward", "nearest")
+"""Methods that need no local features of the queries."""
+FIXED_BY_MAP = ("features", "matcher", "map", "unit", "world_up")
+"""Settings that the stored features and map points depend on, so they cannot change for a query."""
 ODD_DEPTHS_M = (0.1, 200.0)
 """Plausible range of a map's median depth, meters; outside, the map may be in another unit."""
-MOST_IN_MEMORY = 1 << 30
-"""Largest size in bytes of global descriptors (float32) that an open map keeps in memory; larger ones stay on disk."""
 NEAR, NEAR_DEG = 10.0, 60.0
 """Largest distance (in map lengths, see `Survey.length`) and angle (degrees) between a camera and a map image that may
 show the same scene."""
 WORTH_DEG, WORTH_LENGTHS = 0.05, 0.005
 """Noise of the map's poses, degrees and map lengths per axis, from which the user is told of it."""
-RETRIEVAL = "retrieval_dir"
-"""`SETTINGS`, `SESSIONS_ROOT` and `RETRIEVAL` are attributes of `poses/<pair>.h5`: the settings that the pair was
-localized with, the `sessions` folder of the capture, and the folder of the references."""
+MAX_SURE_STD_M = 0.05
+"""An `ok` pose with at most this standard deviation of the position, meters, is precise enough. Otherwise the fallback
+features are used too."""
+MAX_KNOWN = 3
+"""Largest number of earlier poses of a query that the fallback features judge, too."""
 
 
 @dataclass
@@ -87,13 +93,15 @@ class Map:
     mapped: Sequence[MappedFeatures] = ()
     """The map's features of each kind, with their points; empty if `settings.map` is null."""
     escalation: Sequence[DeferredMethod] = ()
-    """Additional kinds for queries whose pose is not sure without them; the map has no points of these kinds."""
+    """Fallback features for queries whose pose is not sure without them; the map has no points of these kinds."""
     features_dir: Path | None = None
     """Folder of all local features."""
     files: SceneFiles | None = None
     """Files of the run; None: images from outside a session cannot be localized, as that needs the run's embedder."""
     reranked: bool = False
     """Whether the run localized with reranked references."""
+    predictor: Predictor | None = None
+    """Network of `feed_forward` and `hybrid`; None: opened as the settings say."""
 
     @classmethod
     def build(
@@ -107,11 +115,12 @@ class Map:
         workers: int = 1,
         skip_existing: bool = True,
         escalation: Sequence[DeferredMethod] = (),
+        predictor: Predictor | None = None,
     ) -> "Map":
         """Extract the features of a map session and triangulate its points, or load existing ones."""
         session, mapped = capture[f"{device}_map"], list[MappedFeatures]()
         root = capture.path / "sessions"
-        map_ = cls(device, root, map_dir, settings, kinds, mapped, escalation, features_dir)
+        map_ = cls(device, root, map_dir, settings, kinds, mapped, escalation, features_dir, predictor=predictor)
         for kind in kinds if settings.map is not None else ():
             turns = map_.turns_of(kind, session)
             store = extract_session(session, features_dir, kind.extractor, workers=workers, turns=turns)
@@ -147,8 +156,8 @@ class Map:
         files = SceneFiles(Path(run), scene)
         pairs = sorted(files.poses_dir.glob(f"{scene}_map_{device}_query_*.h5"))
         if not pairs:
-            raise ArtifactError(f"{_unknown(files, device)} Localize first: python -m toolkit run MANIFEST.")
-        localized = _last_localized(files, pairs)
+            raise ArtifactError(f"{unknown(files, device)} Localize first: python -m toolkit run MANIFEST.")
+        localized = last_localized(files, pairs)
         for pair in pairs:
             require_current(pair.with_suffix(".txt"), "localize", missing=False)
         reranked = Path(localized[1][RETRIEVAL]).name == files.reranked_dir.name
@@ -169,7 +178,7 @@ class Map:
         return cls._stored_in(device, how_localized(Path(poses)), Path(features_dir), Path(map_dir))
 
     @classmethod
-    def _stored_in(cls, device: str, localized: "Localized", features_dir: Path, map_dir: Path) -> "Map":
+    def _stored_in(cls, device: str, localized: Localized, features_dir: Path, map_dir: Path) -> "Map":
         settings, h5_attributes, names = localized
         kinds, escalation = create_methods(settings)
         mapped = [
@@ -194,14 +203,315 @@ class Map:
         """The map session."""
         return self.capture[f"{self.device}_map"]
 
+    # The way of an image
+
+    def query(
+        self,
+        image: Image | Sequence[Image],
+        camera: pycolmap.Camera | Sequence[pycolmap.Camera],
+        rig_from_cams: NDArray[np.float64] | None = None,
+        turns: Sequence[int] | None = None,
+    ) -> Query:
+        """Return a query of any images with cameras; see `scene.query.query_from`."""
+        return query_from(image, camera, rig_from_cams, turns)
+
+    def query_of_session(self, session: Session, rows: Ints) -> Query:
+        """Return a query of images that one device took at one instant, given by their rows in a session."""
+        turns = None if self.turns is None else self.turns.of(session, rows).tolist()
+        images = [session.image_path(int(row)) for row in rows]
+        return query_from(images, session.cameras(rows), session.rig_from_cam(rows), turns)
+
+    @fixed_sums
+    def describe(self, query: Query) -> Query:
+        """Return a query with its local features and, if the map is of a run, its global descriptors.
+
+        Raises:
+            ImageError: an image cannot be read, or has another size than its camera.
+        """
+        query = self._with_features(query)
+        if self.files is None or query.descriptors:
+            return query
+        return replace(query, descriptors=self.search.describe(query, self.kinds))
+
+    @fixed_sums
+    def retrieve(self, query: Query, k: int | None = None, near: RoughPose | None = None) -> list[References]:
+        """Return the references of each image of a described query, as the run would find them.
+
+        Args:
+            query: what `describe` returned.
+            k: number of references; None: as many as in the run.
+            near: a rough pose of the query. Its references then look the same way from nearby, if there are any.
+
+        Raises:
+            ArtifactError: the map was not opened from a run, or was embedded by another embedder.
+        """
+        poses = [] if near is None else list(near.world_from_rig @ query.rig_from_cams)
+        allowed = [self._may_show(pose, near) for pose in poses if near is not None]
+        references = []
+        for rows, scores in self.search.find(query, k, allowed):
+            indices = np.array([self.index_of.get(self.session.image_name(int(row)), -1) for row in rows], np.int64)
+            references.append(References(indices[indices >= 0], scores[indices >= 0]))
+        return references
+
+    def match(self, query: Query, references: Sequence[References]) -> QueryMatches:
+        """Return the matches of a described query with its references; they are computed when they are needed."""
+        return self._match(self.localizer, query, references)
+
+    def solve(self, query: Query, matches: QueryMatches) -> QueryResult:
+        """Return the pose of a query from its matches, without fallback features."""
+        return self.finished(query, self._solve(self.localizer, matches))
+
+    @fixed_sums
+    def locate(
+        self,
+        query: Query,
+        near: RoughPose | None = None,
+        references: Sequence[References] | None = None,
+        prediction: Any = None,
+        fallback: bool = True,
+    ) -> QueryResult:
+        """Return the pose of a query: describe, retrieve, match and solve, and the fallback features if it is unsure.
+
+        Args:
+            query: with or without features.
+            near: a rough pose, if it is known. References are then map images that look the same way from nearby, and
+                features are also matched near the projections of the map points at this pose.
+            references: those of each image; None: retrieve them.
+            prediction: of a network for this query, see `predict`; None: predicted here if it is needed.
+            fallback: whether fallback features may be used; the localize stage extracts those of many queries at once.
+
+        Returns:
+            The result. Its `world_from_rig` (4, 4) is world_from_cam for a single image, and None if `status` is
+            `failed`.
+
+        Raises:
+            ImageError: an image cannot be read, or has another size than its camera (CameraError).
+            ArtifactError: files of the run are missing.
+        """
+        started = time.perf_counter()
+        query = self.describe(query) if references is None else self._with_features(query)
+        references = self.retrieve(query, near=near) if references is None else references
+        priors = [] if near is None else [self._prior(near, references)]
+        result = self._solve(self.localizer, self._match(self.localizer, query, references), prediction, priors)
+        result = self.finished(query, replace(result, seconds=time.perf_counter() - started))
+        if fallback and self.needs_fallback(query, references, result):
+            return self.retry(self._with_fallback_features(query), references, result, priors)
+        return result
+
+    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[Any]:
+        """Return a network's prediction for each query, for `locate`; see `Localizer.predict`."""
+        return self.localizer.predict(self._in_lengths(queries), self._in_lengths(following))
+
+    def needs_fallback(self, query: Query, references: Sequence[References], result: QueryResult) -> bool:
+        """Tell whether a result is not sure, and fallback features might find a better pose."""
+        if self.fallback is None or result.misfit:  # no features repair wrong intrinsics
+            return False
+        limit = MAX_SURE_STD_M * (1.0 if self.settings.unit else self.length)
+        # A pose without matches has no deviation (NaN) and counts as precise.
+        sure = result.status is Status.OK and not result.position_std_m > limit
+        readable = zip(query.features, references, strict=True)
+        return not sure and any(not isinstance(each, str) and len(found.images) for each, found in readable)
+
+    @fixed_sums
+    def retry(
+        self, query: Query, references: Sequence[References], first: QueryResult, priors: Sequence[Prior] = ()
+    ) -> QueryResult:
+        """Retry an unsure query with the fallback features, which it has; return the better of both results.
+
+        `found_by` names the fallback features if the pose was computed with them.
+        """
+        assert self.fallback is not None
+        started = time.perf_counter()
+        poses = [first.world_from_rig, *(rival.world_from_rig for rival in first.rivals)]
+        known = [_canonical(pose) for pose in poses[:MAX_KNOWN] if pose is not None]
+        # The earlier poses are judged by all kinds of features.
+        known_priors = [
+            Prior(pose, images, SEARCH_DEG[0], "first") for pose in known if len(images := self._images_near(pose))
+        ]
+        matches = self._match(self.fallback, query, references)
+        result = self._solve(self.fallback, matches, None, [*priors, *known_priors])
+        result = replace(result, found_by="+".join([result.found_by, *(kind.name for kind in self.escalation)]))
+        better = result.status.rank >= max(first.status.rank, 1)
+        return replace(
+            self.finished(query, result) if better else first,
+            seconds=first.seconds + time.perf_counter() - started,
+            first_status=first.status_text,
+            first_seconds=round(first.seconds, 4),
+        )
+
+    def _match(self, localizer: Localizer, query: Query, references: Sequence[References]) -> QueryMatches:
+        """Return the matches, in the unit that localizers assume."""
+        return localizer.match(query if self.length == 1 else query.scaled(1 / self.length), references)
+
+    def _solve(
+        self, localizer: Localizer, matches: QueryMatches, prediction: Any = None, priors: Sequence[Prior] = ()
+    ) -> QueryResult:
+        """Return the pose in the unit of the map's poses."""
+        if self.length == 1:
+            return localizer.solve(matches, prediction, priors)
+        in_lengths = [prior.scaled(1 / self.length) for prior in priors]
+        return localizer.solve(matches, prediction, in_lengths).scaled(self.length)
+
+    def finished(self, query: Query, result: QueryResult) -> QueryResult:
+        """Return a result with the names of images and method; with low confidence if the map contradicts itself."""
+        posed, images = result.world_from_rig is not None, tuple(view.name for view in query.views)
+        method = result.found_by if posed else ""
+        if self.settings.predicts and self.settings.predictor.name == "simulated":
+            method = f"{self.settings.method}:simulated" + (f"/{method}" if method else "")
+        result = replace(result, images=images, found_by=method or self.settings.method)
+        if self.consistency.trusted or not posed:
+            return result
+        # In such a map, a misfit says nothing about the query's camera.
+        remark = "; ".join(filter(None, ["" if result.misfit else result.remark, self.consistency.text]))
+        what = "poses" if self.consistency.verdict == "inconsistent" else "intrinsics"
+        reason = f"the {what} of the map contradict its images"
+        return replace(
+            result, status=Status.LOW_CONFIDENCE, reason=reason, remark=remark, focals_px=(), centers_px=()
+        )
+
+    def _in_lengths(self, queries: Sequence[QueryInput]) -> Sequence[QueryInput]:
+        if self.length == 1:
+            return queries
+        return [(query.scaled(1 / self.length), references) for query, references in queries]
+
+    def _prior(self, near: RoughPose, references: Sequence[References]) -> Prior:
+        images = np.unique(np.concatenate([retrieved.images for retrieved in references]))
+        position_std = near.position_std_m / self.length  # the depth that it is compared with is in map lengths
+        return Prior.about(near.world_from_rig, images, near.rotation_std_deg, position_std, "near")
+
+    def _may_show(self, world_from_cam: Floats, near: RoughPose) -> NDArray[np.bool_] | None:
+        """Return which searched map images (N,) may show what a camera at a rough pose sees; None if none may."""
+        mask = masks.near(
+            self.session.world_from_cam(self.search.rows),
+            world_from_cam,
+            NEAR * self.length + 3 * near.position_std_m,
+            NEAR_DEG + 3 * near.rotation_std_deg,
+        )
+        return mask if mask.any() else None
+
+    def _images_near(self, world_from_rig: Floats) -> Ints:
+        """Return the map images, by index, that may show what a rig at a pose (4, 4) sees."""
+        return np.flatnonzero(masks.near(self._world_from_cams, world_from_rig, NEAR * self.length, NEAR_DEG))
+
+    @cached_property
+    def _world_from_cams(self) -> Floats:
+        """Poses (N, 4, 4) of the images of the localizer."""
+        rows = np.array([self.session.row_of_name[name] for name in self.localizer.image_names], np.int64)
+        return self.session.world_from_cam(rows)
+
+    def _with_features(self, query: Query) -> Query:
+        if query.features or self.settings.method in WITHOUT_FEATURES or not self.kinds:
+            return query
+        return replace(query, features=[[view.extract(kind) for kind in self.kinds] for view in query.views])
+
+    def _with_fallback_features(self, query: Query) -> Query:
+        features = [
+            first if isinstance(first, str) else [*first, *(view.extract(kind) for kind in self.escalation)]
+            for view, first in zip(query.views, query.features, strict=True)
+        ]
+        return replace(query, features=features, network_matches=[])
+
+    # What the way is made of
+
+    @cached_property
+    def localizer(self) -> Localizer:
+        """The localizer of the map's settings, in map lengths.
+
+        Raises:
+            ArtifactError: the map was built for `nearest` and has no points.
+            WeightsError: the network has no weights.
+        """
+        settings = self.settings
+        if settings.method == "nearest":
+            posed = PosedImages.of_session(self.session, None, self.length)
+            return NearestLocalizer(posed.names, posed.world_from_cams)
+        if not self.kinds:
+            raise ArtifactError(
+                f"The map of {self.device!r} was built for another method than {settings.method!r} and has no points, "
+                f"which it needs. Localize with {settings.method!r} first."
+            )
+        if settings.map is None:
+            return self._on_demand_localizer(self.kinds)
+        pnp = PnpLocalizer(self.in_lengths, settings.pnp, settings.seed)
+        if not settings.predicts:
+            return pnp
+        predictor = self.predictor or open_predictor(settings, self.capture, self.map_dir)
+        local_map, turns = self.in_lengths[0].map, self.turns_for(settings)
+        feed_forward = FeedForwardLocalizer(local_map, self.session, predictor, settings.predictor, turns, self.length)
+        return feed_forward if settings.method == "feed_forward" else HybridLocalizer(pnp, feed_forward)
+
+    @cached_property
+    def fallback(self) -> Localizer | None:
+        """Localizer with the fallback features besides; None if there are none."""
+        applies = self.escalation and self.settings.method in ("pnp", "hybrid")
+        if not applies or not self.consistency.trusted:  # no features make up for a wrong map
+            return None
+        kinds: list[AnyMethod] = [*(self.kinds if self.settings.map is None else ()), *self.escalation]
+        return self._on_demand_localizer(kinds, self.localizer.image_names)
+
+    def _on_demand_localizer(self, kinds: Sequence[AnyMethod], names: list[str] | None = None) -> OnDemandLocalizer:
+        """Return a localizer with the points of the map, and for the given kinds points triangulated for each query.
+
+        `names` are the names of its images; None: all map images with a pose.
+        """
+        settings = self.settings
+        return OnDemandLocalizer(
+            PosedImages.of_session(self.session, names, self.length, self.refined_poses),
+            self.in_lengths,
+            [(kind, partial(lambda kind, name: self.on_demand(kind)(name), kind)) for kind in kinds],
+            settings.map,
+            settings.pnp,
+            settings.seed,
+        )
+
+    def changed(self, changes: Mapping[str, Any]) -> "Map":
+        """Return the map with changed settings; it shares features, points and descriptors with this one.
+
+        Raises:
+            ManifestError: a setting is unknown, or the stored features or the map depend on it.
+        """
+        settings, before = LocalizeSettings.of(self.settings, changes), self.settings
+        if fixed := [name for name in FIXED_BY_MAP if getattr(settings, name) != getattr(before, name)]:
+            raise ManifestError(
+                f"{', '.join(fixed)}: found other settings than those of the run. The stored features and the map "
+                "depend on them, so they cannot change for one query. Settings that can: pnp, predictor, method, seed. "
+                f"To change these: python -m toolkit run MANIFEST --set localize.{fixed[0]}=..."
+            )
+        other = copy.copy(self)
+        other.settings = settings
+        for name in ("localizer", "fallback", "turns", "index_of", "_world_from_cams"):
+            other.__dict__.pop(name, None)
+        return other
+
+    @cached_property
+    def search(self) -> ReferenceSearch:
+        """The embedders and descriptors of the run.
+
+        Raises:
+            ArtifactError: the map was not opened from a run.
+        """
+        if self.files is None:
+            raise ArtifactError("This map was not opened from a run, so its embedder is unknown. Use Map.open.")
+        return ReferenceSearch(self.files, self.session, self.reranked)
+
+    def load(self) -> None:
+        """Load what all queries share, before several threads find it missing: `cached_property` has no lock."""
+        _ = self.localizer, self.index_of, self.fallback
+        self.search.load()
+        for kind in self.escalation:
+            _ = kind.extractor
+
+    @cached_property
+    def index_of(self) -> dict[str, int]:
+        """Index of each map image in `localizer.image_names`, by its name."""
+        return {name: index for index, name in enumerate(self.localizer.image_names)}
+
     @cached_property
     def turns(self) -> Turns | None:
         """The turns that make the capture's images upright; None if no network of the run needs upright images."""
         if (turns := self.turns_for(self.settings)) is not None:
             return turns
-        reranks = self.reranked and KINDS[self._verification[0].name].upright
-        describes = self.files is not None and any(map(self.shows_upright, self.embedders))
-        return self._upright if reranks or describes else None
+        return self._upright if self.files is not None and self.search.shows_upright else None
 
     def turns_for(self, settings: LocalizeSettings) -> Turns | None:
         """Return the turns for a localizer in this map; None if it needs no upright images.
@@ -217,10 +527,6 @@ class Map:
     @cached_property
     def _upright(self) -> Turns:
         return upright_turns(self.capture, self.settings.world_up)
-
-    def shows_upright(self, embedder: Embedder) -> bool:
-        """Tell whether the run turned images upright for one of its embedders."""
-        return shows_upright(embedder, self.embed_settings.upright)
 
     def turns_of(self, kind: AnyMethod, session: Session) -> NDArray[np.int64] | None:
         """Return the turns that make a session's images upright; None if this kind of features does not need them."""
@@ -260,11 +566,6 @@ class Map:
         return [kind.with_map(kind.map.scaled(1 / self.length)) for kind in self.mapped]
 
     @property
-    def sure_position_std(self) -> float:
-        """`SURE_POSITION_STD_M` in the unit of the poses."""
-        return SURE_POSITION_STD_M * (1.0 if self.settings.unit else self.length)
-
-    @property
     def remarks(self) -> str:
         """Warnings for the user about the map; empty if there are none, or if the map has no points."""
         if not self.mapped:
@@ -296,367 +597,39 @@ class Map:
         unit = {"unit": self.settings.unit, "depth": depth, "length": self.length}
         return {**unit, "text": self.remarks, **asdict(self.consistency)}
 
-    def judged(self, estimate: PoseEstimate) -> PoseEstimate:
-        """Return the estimate; with low confidence if the map's poses or intrinsics contradict its images."""
-        if self.consistency.trusted or estimate.world_from_rig is None:
-            return estimate
-        # In such a map, a misfit says nothing about the query's camera.
-        reason = "; ".join(filter(None, ["" if estimate.misfit else estimate.reason, self.consistency.text]))
-        what = "poses" if self.consistency.verdict == "inconsistent" else "intrinsics"
-        status = f"low_confidence: the {what} of the map contradict its images"
-        return replace(estimate, status=status, reason=reason, focals_px=(), centers_px=())
 
-    @cached_property
-    def localizer(self) -> Localizer:
-        """The localizer of the map's own settings."""
-        return create_localizer(self.settings, self)
-
-    def load(self) -> None:
-        """Load what all queries share, before several threads find it missing: `cached_property` has no lock."""
-        _ = self.localizer, self.index_of, self.embedders, self._descriptors, self._index
-        if self.reranked:
-            _ = self._verification
-        for kind in self.escalation:
-            _ = kind.extractor
-
-    @cached_property
-    def index_of(self) -> dict[str, int]:
-        """Index of each map image in `localizer.image_names`, by its name."""
-        return {name: index for index, name in enumerate(self.localizer.image_names)}
-
-    @cached_property
-    def embed_settings(self) -> EmbedSettings:
-        """Embed settings of the run."""
-        return _read_settings(self._run.embeddings / "settings.json", EmbedSettings)
-
-    @cached_property
-    def retrieve_settings(self) -> RetrieveSettings:
-        """Retrieve settings of the run."""
-        return _read_settings(self._run.retrieval_dir / "settings.json", RetrieveSettings)
-
-    @cached_property
-    def embedders(self) -> list[Embedder]:
-        """The embedders that the run used.
-
-        Raises:
-            ArtifactError: the map's vectors are from another one.
-        """
-        settings = self.embed_settings
-        folders = embedding_folders(self._run.embeddings).values()
-        learned = {
-            "checkpoint": settings.checkpoint,
-            "device": settings.compute_device,
-            "dtype_compute": settings.dtype_compute,
-            "image_size": settings.image_size,
-        }
-        embedders = [
-            create_embedder(name, **({"vocabulary": folder / "vlad.npz"} if name == "vlad" else learned))
-            for name, folder in zip(settings.models, folders, strict=True)
-        ]
-        for embedder, vectors in zip(embedders, self._stored[0].each, strict=True):
-            if vectors.embedder not in ("", embedder_fingerprint(embedder.settings)):
-                raise ArtifactError(
-                    f"{vectors.paths[0]} was made by another embedder or vocabulary than the run's {embedder.name} of "
-                    "now. Run the embed stage again."
-                )
-        return embedders
-
-    @property
-    def _run(self) -> SceneFiles:
-        if self.files is None:
-            raise ArtifactError("This map was not opened from a run, so its embedder is unknown. Use Map.open.")
-        return self.files
-
-    @cached_property
-    def _stored(self) -> tuple[Vectors, NDArray[np.int64]]:
-        """Global descriptors (N, D) of the posed map images, on disk, as they are searched; rows of the images (N,)."""
-        normalize = self.retrieve_settings.normalize
-        vectors, table = open_descriptors(self._run.embeddings, f"{self.device}_map", normalize)
-        rows = np.array([self.session.row_of_name[image_name(path)] for path in table["abs_path"]], np.int64)
-        posed = np.isfinite(self.session.world_from_cam(rows)).reshape(-1, 16).all(axis=1)
-        return vectors.choose(np.flatnonzero(posed)), rows[posed]
-
-    @cached_property
-    def _descriptors(self) -> tuple[NDArray[np.float32] | Vectors, NDArray[np.int64]]:
-        """`_stored`, in memory unless the map is large."""
-        vectors, rows = self._stored
-        small = 4 * vectors.shape[1] * len(vectors) < MOST_IN_MEMORY
-        return vectors[:] if small else vectors, rows
-
-    @cached_property
-    def _index(self) -> VectorIndex | JoinedIndex | None:
-        """The index of the descriptors, if the run has one."""
-        settings = self.retrieve_settings.model_copy(update={"faiss_gpu": False})  # this machine may have no GPU
-        return load_index(self._run.embeddings, f"{self.device}_map", self._stored[0], settings)
-
-    def retrieve(
-        self,
-        described: Sequence[NDArray[np.float32]],
-        pictures: Sequence[Callable[[bool], NDArray[np.uint8]]] = (),
-        cameras: Sequence[pycolmap.Camera] = (),
-        turns: Sequence[int] = (),
-        near: Sequence[RoughPose] = (),
-    ) -> list[References]:
-        """Return the references of Q query images, as the run would find them.
-
-        Args:
-            described: for each of the `embedders`, its global descriptors (Q, D) of the images.
-            pictures: for each image a function that returns its pixels, in color if called with True. Needed only if
-                the run reranks, like `cameras` and `turns`.
-            cameras: intrinsics of the images.
-            turns: quarter turns that make the images upright.
-            near: rough poses of the cameras, to which retrieval is restricted; empty: no restriction.
-
-        Raises:
-            ArtifactError: the map was embedded by another embedder.
-        """
-        database, rows = self._descriptors
-        dims = self._stored[0].dims
-        for embedder, vectors, dim in zip(self.embedders, described, dims, strict=True):
-            if vectors.shape[1] != dim:
-                raise ArtifactError(
-                    f"{self._run.embeddings}: found descriptors of {dim} dimensions for the map, expected "
-                    f"{vectors.shape[1]} of {embedder.name}. Run the embed stage again."
-                )
-        query = np.hstack([self._as_searched(vectors) for vectors in described])
-        topk = self.retrieve_settings.topk
-        allowed = [self._may_show(rows, pose) for pose in near] or [None]
-        parts = np.split(query, len(allowed))
-        results = [
-            search(part, database, topk, "torch", "cpu", index=self._index, allowed=mask, dims=dims)
-            for part, mask in zip(parts, allowed, strict=True)
-        ]
-        all_scores, neighbors = (np.concatenate(arrays) for arrays in zip(*results, strict=True))
-        ranked = [
-            (rows[indices[indices >= 0]], scores[indices >= 0].astype(np.float64))
-            for indices, scores in zip(neighbors, all_scores, strict=True)
-        ]
-        if self.reranked:
-            ranked = [self._rerank(*image) for image in zip(ranked, pictures, cameras, turns, strict=True)]
-        references = []
-        for images, similarities in ranked:
-            indices = np.array([self.index_of.get(self.session.image_name(int(row)), -1) for row in images], np.int64)
-            references.append(References(indices[indices >= 0], similarities[indices >= 0]))
-        return references
-
-    def _may_show(self, rows: NDArray[np.int64], pose: RoughPose) -> NDArray[np.bool_] | None:
-        """Return which map images (N,) may show what a camera at a rough pose sees; None if none may.
-
-        Args:
-            rows: of the map images in the session.
-            pose: of the camera.
-        """
-        mask = masks.near(
-            self.session.world_from_cam(rows),
-            pose.world_from_rig,
-            NEAR * self.length + 3 * pose.position_std_m,
-            NEAR_DEG + 3 * pose.rotation_std_deg,
-        )
-        return mask if mask.any() else None
-
-    def _as_searched(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return descriptors normalized and rounded like those of the map, which were written to a file."""
-        if self.embed_settings.normalize:
-            vectors = unit(vectors)
-        vectors = vectors.astype(self.embed_settings.dtype).astype(np.float32)
-        return unit(vectors) if self.retrieve_settings.normalize else vectors
-
-    @cached_property
-    def _verification(self) -> tuple[LocalMethod, Verifier]:
-        """Features and verifier of the run's rerank stage."""
-        settings = _read_settings(self._run.reranked_dir / "settings.json", RerankSettings)
-        (method,) = create_local_methods(settings)
-        store = FeatureStore.of_session(self._run.features, f"{self.device}_map", method.extractor.settings)
-        return method, Verifier(settings, method.matcher, store)
-
-    def _rerank(
-        self,
-        ranked: tuple[NDArray[np.int64], NDArray[np.float64]],
-        picture: Callable[[bool], NDArray[np.uint8]],
-        camera: pycolmap.Camera,
-        turns: int,
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return rows of map images and their inlier counts, most inliers first, as the rerank stage does."""
-        method, verifier = self._verification
-        settings, rows = verifier.settings, ranked[0][: verifier.settings.topn]
-        pixels = picture(method.extractor.color)
-        turns = turns if KINDS[method.name].upright else 0
-        (features,) = extract_turned(method.extractor, [pixels], [turns])
-        readable = [index for index, row in enumerate(rows) if self.session.image_name(int(row)) in verifier.store]
-        inliers = np.zeros(len(rows))
-        inliers[readable], _ = verifier.verify(
-            features,
-            camera,
-            [self.session.image_name(int(rows[index])) for index in readable],
-            self.session.cameras(rows[readable]),
-        )
-        order = np.argsort(-inliers, kind="stable")[: settings.topk]
-        return rows[order], inliers[order]
+def _canonical(pose: Floats) -> Floats:
+    """Return a pose (4, 4) as it is read from a file, so that results do not depend on whether it was stored."""
+    return geometry.pose_from_qt(geometry.qt_from_pose(pose))
 
 
-def no_such_run(run: Path) -> str:
-    """Return a message that lists the runs beside a folder that is none."""
-    return f"{run}: no such run. {nearest(run.name, [path.parent.name for path in run.parent.glob(f'*/{RECORD}')])}"
-
-
-def localized_scenes(run: Path) -> list[str]:
-    """Return the names of the captures that a run has localized, in order."""
-    return sorted(path.parent.name for path in run.glob("*/poses"))
-
-
-def _unknown(files: SceneFiles, device: str) -> str:
-    """Return a message that says which of run, scene and device is unknown, and lists the known ones."""
-    run = files.run
-    if not run.is_dir():
-        return no_such_run(run)
-    scenes = localized_scenes(run)
-    if files.scene not in scenes:
-        return f"{run}: no poses of the scene {files.scene!r}. {nearest(files.scene, scenes)}"
-    devices = {pair_devices(path.stem)[0] for path in files.poses_dir.glob("*.h5")}
-    return f"{files.poses_dir}: no poses of queries in the map of {device!r}. {nearest(device, devices)}"
-
-
-Localized = tuple[LocalizeSettings, dict[str, Any], list[str]]
-"""Settings that a pair was localized with, attributes of its `.h5` file, and the file names of its maps."""
-
-
-def how_localized(pair: Path) -> Localized:
-    """Return how the queries of a pair were localized.
+@fixed_sums
+def localize_image(
+    scene_map: Map,
+    image: Image | Sequence[Image],
+    camera: pycolmap.Camera | Sequence[pycolmap.Camera],
+    rig_from_cams: NDArray[np.float64] | None = None,
+    turns: Sequence[int] | None = None,
+    near: RoughPose | None = None,
+) -> QueryResult:
+    """Localize one image, or those of a rig, as the run of the map would: `Map.query` and `Map.locate` in one call.
 
     Args:
-        pair: `poses/<pair>.h5`.
+        scene_map: an open map, see `Map.open`; it is not changed.
+        image, camera, rig_from_cams, turns: see `scene.query.query_from`.
+        near: a rough pose, if it is known; see `Map.locate`.
 
     Raises:
-        ArtifactError: the file is missing, damaged, or lacks the attributes.
+        ImageError, CameraError, ArtifactError: see `Map.query` and `Map.locate`.
     """
-    try:
-        with h5py.File(pair, "r") as file:
-            attributes = dict(file.attrs)
-            return LocalizeSettings.of(json.loads(attributes[SETTINGS])), attributes, json.loads(attributes[MAPS])
-    except ManifestError:
-        raise ArtifactError(f"{pair}: another version of the toolkit has localized it. Localize again.") from None
-    except (*HDF5_ERRORS, ToolkitError) as error:
-        raise ArtifactError(f"{pair}: cannot read how it was localized ({error}). Localize again.") from None
-
-
-def _last_localized(files: SceneFiles, pairs: Sequence[Path]) -> Localized:
-    """Return how a pair of the last run was localized; pairs of earlier runs may have other settings.
-
-    The last run is known by its settings file. File times would be unreliable, as clocks can be set back.
-    """
-    last = None
-    with suppress(ArtifactError):  # the run is of a version that wrote no such file, or other settings
-        last = _read_settings(files.poses_dir / "settings.json", LocalizeSettings)
-    localized, message = [], ""
-    for pair in pairs:
-        try:
-            localized.append(how_localized(pair))
-        except ArtifactError as error:
-            message = str(error)
-    if not localized:
-        raise ArtifactError(message)
-    return next((one for one in localized if one[0] == last), localized[-1])
-
-
-AnySettings = TypeVar("AnySettings", bound=Settings)
-
-
-def _read_settings(path: Path, model: type[AnySettings]) -> AnySettings:
-    """Return the settings that a stage wrote beside its results.
-
-    Raises:
-        ArtifactError: the file is missing, damaged, or of another version.
-    """
-    try:
-        return model.of(json.loads(path.read_text(encoding="utf-8")))
-    except ManifestError:
-        raise ArtifactError(f"{path}: another version of the toolkit wrote it. Run the stage again.") from None
-    except (OSError, ValueError) as error:
-        raise ArtifactError(f"{path}: cannot read the settings of the stage ({error}). Run the stage again.") from None
-
-
-def session_fingerprint(session: Session) -> str:
-    """Return 16 hex digits that identify the calibration, poses and image list of a session."""
-    files = ["sensors.txt", "images.txt", "rigs.txt", "trajectories.txt"]
-    return fingerprint([file_fingerprint(session.path / name) for name in files if (session.path / name).exists()])
+    if not isinstance(scene_map, Map):
+        raise ArtifactError(f"Found {type(scene_map).__name__} for a map, expected what `Map.open` returns.")
+    return scene_map.locate(scene_map.query(image, camera, rig_from_cams, turns), near)
 
 
 def needs_upright(settings: LocalizeSettings, kinds: Sequence[AnyMethod]) -> bool:
     """Tell whether a network that localizes needs upright images; `kinds` are the kinds of features."""
     return settings.predicts or any(KINDS[kind.name].upright for kind in kinds)
-
-
-def create_localizer(settings: LocalizeSettings, map: Map, predictor: Predictor | None = None) -> Localizer:  # noqa: A002
-    """Return the localizer of `settings.method` for a map.
-
-    Args:
-        settings: those of the map, or others that need the same features.
-        map: the map.
-        predictor: for `feed_forward` and `hybrid`; None: opened according to the settings.
-
-    Raises:
-        ArtifactError: the map was built for `nearest` and has no points.
-        WeightsError: the network has no weights.
-    """
-    if settings.method == "nearest":
-        posed = PosedImages.of_session(map.session)
-        return NearestLocalizer(posed.names, posed.world_from_cams)
-    if not map.kinds:
-        raise ArtifactError(
-            f"The map of {map.device!r} was built for the method {map.settings.method!r} and has no points, which the "
-            f"method {settings.method!r} needs. Localize with {settings.method!r} first."
-        )
-    if settings.map is None:
-        return _escalating(_on_demand(settings, map, map.kinds), settings, map)
-    pnp = PnpLocalizer(map.in_lengths, settings.pnp, settings.seed)
-    if not settings.predicts:
-        return _escalating(_scaled(pnp, map), settings, map)
-    predictor = predictor or open_predictor(settings, map.capture, map.map_dir)
-    local_map, turns = map.in_lengths[0].map, map.turns_for(settings)
-    feed_forward = FeedForwardLocalizer(local_map, map.session, predictor, settings.predictor, turns, map.length)
-    if settings.method == "feed_forward":
-        return _scaled(feed_forward, map)
-    return _escalating(_scaled(HybridLocalizer(pnp, feed_forward), map), settings, map)
-
-
-def _scaled(localizer: Localizer, map: Map) -> Localizer:  # noqa: A002
-    return localizer if map.length == 1.0 else ScaledLocalizer(localizer, map.length)
-
-
-def _escalating(first: Localizer, settings: LocalizeSettings, map: Map) -> Localizer:  # noqa: A002
-    """Return a localizer that uses the escalation features, if there are any, where `first` gives no sure pose."""
-    if not map.escalation or not map.consistency.trusted:  # no features make up for a wrong map
-        return first
-    kinds: list[AnyMethod] = [*(map.kinds if settings.map is None else ()), *map.escalation]
-    second = _scaled(_on_demand(settings, map, kinds, first.image_names), map)
-    rows = np.array([map.session.row_of_name[name] for name in first.image_names], np.int64)
-    near = partial(_images_near, map.session.world_from_cam(rows), NEAR * map.length)
-    return EscalatingLocalizer(first, second, map.escalation, map.sure_position_std, near)
-
-
-def _images_near(world_from_cams: Floats, distance: float, world_from_rig: Floats) -> Ints:
-    """Return the map images, by index, that may show what a rig at a pose (4, 4) sees."""
-    return np.flatnonzero(masks.near(world_from_cams, world_from_rig, distance, NEAR_DEG))
-
-
-def _on_demand(
-    settings: LocalizeSettings,
-    map: Map,  # noqa: A002
-    kinds: Sequence[AnyMethod],
-    names: list[str] | None = None,
-) -> OnDemandLocalizer:
-    """Return a localizer with the points of the map, and for the given kinds points triangulated for each query.
-
-    `names` are the names of its images; None: all map images with a pose.
-    """
-    return OnDemandLocalizer(
-        PosedImages.of_session(map.session, names, map.length, map.refined_poses),
-        map.in_lengths,
-        [(kind, partial(lambda kind, name: map.on_demand(kind)(name), kind)) for kind in kinds],
-        settings.map,
-        settings.pnp,
-        settings.seed,
-    )
 
 
 def create_methods(settings: LocalizeSettings) -> tuple[list[LocalMethod], list[DeferredMethod]]:
@@ -671,41 +644,3 @@ def create_methods(settings: LocalizeSettings) -> tuple[list[LocalMethod], list[
     if further:
         weights_files(settings)
     return create_local_methods(settings), [DeferredMethod(settings, name) for name in further]
-
-
-def label(settings: LocalizeSettings, found_by: str) -> str:
-    """Return the `method` column of a table row: how the pose was found; without a pose, the method of the run."""
-    if settings.predicts and settings.predictor.name == "simulated":
-        return f"{settings.method}:simulated" + (f"/{found_by}" if found_by else "")
-    return found_by or settings.method
-
-
-def attributes(
-    settings: LocalizeSettings, kinds: Sequence[LocalMethod], capture: Capture, device: str, retrieval_dir: Path
-) -> dict[str, str]:
-    """Return the attributes of a pair's `.h5` file from which `Map.open` opens the map.
-
-    Args:
-        settings, kinds: those that the queries were localized with.
-        capture: the capture.
-        device: the map device.
-        retrieval_dir: folder of the references.
-    """
-    return {
-        MAPS: json.dumps([map_path("", f"{device}_map", kind.name).name for kind in kinds if settings.map is not None]),
-        SETTINGS: settings.model_dump_json(),
-        SESSIONS_ROOT: str(capture.path / "sessions"),
-        RETRIEVAL: str(retrieval_dir),
-    }
-
-
-def update_attributes(path: Path, attributes: Mapping[str, str]) -> bool:
-    """Update the attributes of a file if equivalent settings made it or its capture moved; tell if any changed."""
-    with h5py.File(path, "r") as file:
-        current = {name: file.attrs.get(name) for name in attributes} == dict(attributes)
-    if not current:
-        with write_atomic(path) as temporary:
-            shutil.copyfile(path, temporary)
-            with h5py.File(temporary, "a", libver="latest") as file:
-                file.attrs.update(attributes)
-    return not current

@@ -7,11 +7,12 @@ from typing import Any
 
 import pandas as pd
 
-from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError
-from toolkit.files import SceneFiles, of_sequence, pair_devices, read_json
+from toolkit.files import SceneFiles, read_json
+from toolkit.results.pair import PairResults, pairs_of
 from toolkit.runs.record import RECORD
-from toolkit.scene.map import Map, localized_scenes, no_such_run
+from toolkit.scene.map import Map
+from toolkit.scene.opening import localized_scenes, no_such_run
 
 
 @dataclass(frozen=True)
@@ -68,10 +69,10 @@ class Run:
         """
         keys, tables = ("scene", "map_device", "query_device"), list[pd.DataFrame]()
         for scene in self.scenes:
-            for path in sorted(SceneFiles(self.path, scene).poses_dir.glob("*.csv")):
-                if not of_sequence(path.stem):
-                    table = read_query_table(path, ["status"])
-                    for column, value in enumerate((scene, *pair_devices(path.stem))):
-                        table.insert(column, keys[column], value)
-                    tables.append(table)
+            for path in pairs_of(SceneFiles(self.path, scene).poses_dir):
+                results = PairResults.open(path)
+                table = results.table.copy()
+                for column, value in enumerate((scene, *results.devices)):
+                    table.insert(column, keys[column], value)
+                tables.append(table)
         return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=[*keys, "status"])

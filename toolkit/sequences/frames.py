@@ -13,15 +13,16 @@ from toolkit import geometry
 from toolkit.errors import CameraError, ImageError
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import SequenceSettings
-from toolkit.pose.base import PoseEstimate, RoughPose, carried_over
-from toolkit.scene.locate import Picture, localize_image
-from toolkit.scene.map import Map
+from toolkit.pose.base import RoughPose, carried_over
+from toolkit.pose.result import QueryResult, Status
+from toolkit.scene.map import Map, localize_image
+from toolkit.scene.query import Image
 from toolkit.sequences.odometry import Odometry, cut, with_measured_drift
 from toolkit.sequences.piece import localize_piece, queries_of
 from toolkit.sequences.pose_graph import FAR, PlacedPiece, is_sure
 from toolkit.threads import fixed_sums
 
-Pictures = Picture | Sequence[Picture] | None
+Images = Image | Sequence[Image] | None
 """The picture of a frame, one picture per camera of a rig, or None for a frame with odometry only."""
 Cameras = pycolmap.Camera | Sequence[pycolmap.Camera]
 
@@ -38,9 +39,9 @@ class LocalizedFrames:
     """(N,) `ok`, `low_confidence: <reason>` or `failed: <reason>`."""
     piece: Ints
     """(N,) number of the piece of odometry; losses of tracking separate pieces."""
-    single: dict[int, PoseEstimate]
+    single: dict[int, QueryResult]
     """Estimate from each picture alone, by frame."""
-    again: dict[int, PoseEstimate]
+    again: dict[int, QueryResult]
     """Estimates of doubtful pictures that were localized again near their predicted pose, by frame."""
 
 
@@ -48,23 +49,23 @@ def _localize(
     map_: Map,
     rig_from_cams: NDArray[np.float64] | None,
     turns: Sequence[int] | None,
-    picture: Pictures,
+    picture: Images,
     cameras: Cameras,
     near: RoughPose | None = None,
-) -> PoseEstimate:
+) -> QueryResult:
     """Localize the picture of a frame, alone or near a pose. A picture that cannot be read gives `failed`."""
     try:
         return localize_image(map_, picture, cameras, rig_from_cams, turns, near=near)
     except CameraError:
         raise
     except ImageError as error:
-        return PoseEstimate(f"failed: {error}")
+        return QueryResult.failed(str(error))
 
 
 @fixed_sums
 def localize_sequence(
     map_: Map,
-    images: Sequence[Pictures],
+    images: Sequence[Images],
     cameras: Cameras | Sequence[Cameras],
     odometry: Odometry,
     settings: SequenceSettings | dict[str, Any] | None = None,
@@ -100,7 +101,7 @@ def localize_sequence(
         )
     localize = partial(_localize, map_, rig_from_cams, turns)
     single = {frame: localize(image, cams_of_frames[frame]) for frame, image in enumerate(images) if image is not None}
-    piece, again = np.zeros(len(odometry), int), dict[int, PoseEstimate]()
+    piece, again = np.zeros(len(odometry), int), dict[int, QueryResult]()
     placed = list[PlacedPiece]()
     pieces, queries = odometry.split(), queries_of(single)
     if not settings.online:
@@ -114,7 +115,7 @@ def localize_sequence(
         piece[rows] = number
         frames = np.array([frame for frame in single if rows.start <= frame < rows.stop], np.int64)
 
-        def localize_again(todo: Sequence[tuple[int, RoughPose]], start: int = rows.start) -> list[PoseEstimate]:
+        def localize_again(todo: Sequence[tuple[int, RoughPose]], start: int = rows.start) -> list[QueryResult]:
             return [localize(images[start + frame], cams_of_frames[start + frame], near) for frame, near in todo]
 
         relocalize = localize_again if settings.relocalize else None
@@ -154,13 +155,13 @@ class SequenceLocalizer:
         """Single poses of the current piece, including those found again."""
         self._solved: tuple[int, PlacedPiece] | None = None
         """Frame of the last picture, and the solution there."""
-        self.single: PoseEstimate | None = None
+        self.single: QueryResult | None = None
         """Estimate from the latest frame's picture alone; None if it had no picture."""
 
     @fixed_sums
     def add(
-        self, timestamp: int, odom_from_rig: ArrayLike, image: Pictures = None, cameras: Cameras | None = None
-    ) -> PoseEstimate:
+        self, timestamp: int, odom_from_rig: ArrayLike, image: Images = None, cameras: Cameras | None = None
+    ) -> QueryResult:
         """Add a frame and return its pose, with `found_by` = `sequence`.
 
         Args:
@@ -200,7 +201,7 @@ class SequenceLocalizer:
         del self._timestamps[:start], self._poses[:start]
         self._queries = self._queries.part(slice(start, start + len(self._poses)))
 
-    def _solve(self, image: Pictures, cameras: Cameras) -> PoseEstimate:
+    def _solve(self, image: Images, cameras: Cameras) -> QueryResult:
         if self.settings.length_s is not None:
             oldest = self._timestamps[-1] - self.settings.length_s * 1e6
             self._drop_before(int(np.searchsorted(self._timestamps, oldest)))
@@ -209,7 +210,7 @@ class SequenceLocalizer:
         window = self._since(0)
         offline = self._drift.model_copy(update={"online": False, "length_s": None})
 
-        def localize_again(todo: Sequence[tuple[int, RoughPose]]) -> list[PoseEstimate]:
+        def localize_again(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
             return [self._localize(image, cameras, near) for _, near in todo]
 
         again = localize_again if self.settings.relocalize else None
@@ -217,17 +218,17 @@ class SequenceLocalizer:
         self._queries, placed = done.queries, done.placed
         self._solved = len(window) - 1, placed
         if not np.isfinite(placed.world_from_rig[-1]).all():
-            return PoseEstimate(str(placed.status[-1]), found_by="sequence")
+            return QueryResult(*Status.parse(str(placed.status[-1])), found_by="sequence")
         return self._estimate(placed.world_from_rig[-1], placed.covariances[-1], str(placed.status[-1]))
 
-    def _extrapolate(self) -> PoseEstimate:
+    def _extrapolate(self) -> QueryResult:
         """Return the pose of the latest frame by odometry from the last picture."""
         if self._solved is None:
-            return PoseEstimate("failed: no query of this piece has a pose", found_by="sequence")
+            return QueryResult.failed("no query of this piece has a pose", found_by="sequence")
         last, placed = self._solved
         status = str(placed.status[-1])
         if not np.isfinite(placed.world_from_rig[-1]).all():
-            return PoseEstimate(status, found_by="sequence")
+            return QueryResult(*Status.parse(status), found_by="sequence")
         since = self._since(last).scaled(placed.scale)
         step = geometry.invert(since.odom_from_rig[0]) @ since.odom_from_rig[-1]
         rotation_std, position_std = since.drift(self._drift, np.array([0]), np.array([len(since) - 1]))
@@ -237,10 +238,12 @@ class SequenceLocalizer:
         status = FAR if status == "ok" and not is_sure(covariance[None])[0] else status
         return self._estimate(placed.world_from_rig[-1] @ step, covariance, status)
 
-    def _estimate(self, pose: Floats, covariance: Floats, status: str) -> PoseEstimate:
+    def _estimate(self, pose: Floats, covariance: Floats, status: str) -> QueryResult:
+        parsed, reason = Status.parse(status)
         return replace(
-            self.single or PoseEstimate(status),
-            status=status,
+            self.single or QueryResult(parsed),
+            status=parsed,
+            reason=reason,
             world_from_rig=pose,
             covariance=covariance,
             found_by="sequence",

@@ -12,12 +12,13 @@ import numpy as np
 from toolkit import geometry
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import SequenceSettings
-from toolkit.pose.base import PoseEstimate, RoughPose, agree, stds_of
+from toolkit.pose.base import RoughPose
+from toolkit.pose.result import QueryResult, Status, agree, stds_of
 from toolkit.sequences.odometry import UNKNOWN_COVARIANCE, Odometry, PosedQueries, place, vote_weights
 from toolkit.sequences.pose_graph import PlacedPiece, place_online, place_piece
 from toolkit.threads import fixed_sums
 
-Relocalize = Callable[[Sequence[tuple[int, RoughPose]]], Sequence[PoseEstimate]]
+Relocalize = Callable[[Sequence[tuple[int, RoughPose]]], Sequence[QueryResult]]
 """Function that localizes queries again: takes (frame in the piece, predicted pose) pairs, returns their estimates."""
 
 
@@ -28,7 +29,7 @@ class LocalizedPiece:
     placed: PlacedPiece
     queries: PosedQueries
     """The single poses of the final graph: the first ones and those found again."""
-    again: Mapping[int, PoseEstimate]
+    again: Mapping[int, QueryResult]
     """Estimates of the queries that were localized again near their predicted pose, by frame."""
     steps: Mapping[str, Floats]
     """world_from_rig (A, 4, 4) of the query frames after each of `STEPS`, NaN for none."""
@@ -61,7 +62,7 @@ def localize_piece(
     sure = queries.frames[first.used & queries.trusted]
     predicted = query_frames[np.isfinite(first.world_from_rig[query_frames]).all(axis=(1, 2))]
     doubtful = np.setdiff1d(predicted, sure).tolist()
-    relocalized: dict[int, PoseEstimate] = {}
+    relocalized: dict[int, QueryResult] = {}
     if again is not None and doubtful:
         stds = zip(*(each.tolist() for each in stds_of(first.covariances[doubtful])), strict=True)
         rough = [RoughPose(pose, *std) for pose, std in zip(first.world_from_rig[doubtful], stds, strict=True)]
@@ -97,7 +98,7 @@ def _median_placement(odometry: Odometry, agreeing: PosedQueries) -> Floats:
     return np.asarray(candidates[int(np.argmin(np.median(off_m, axis=1)))])
 
 
-def with_relocalized(queries: PosedQueries, relocalized: Mapping[int, PoseEstimate]) -> PosedQueries:
+def with_relocalized(queries: PosedQueries, relocalized: Mapping[int, QueryResult]) -> PosedQueries:
     """Return the single poses, updated with poses that were found again near a predicted pose.
 
     A new pose that agrees with the first pose of its frame replaces it. Any other new pose is added without a vote on
@@ -106,7 +107,7 @@ def with_relocalized(queries: PosedQueries, relocalized: Mapping[int, PoseEstima
     if not relocalized:
         return queries
     poses, covariances = queries.world_from_rig.copy(), queries.covariances.copy()
-    added: dict[int, PoseEstimate] = {}
+    added: dict[int, QueryResult] = {}
     for frame, estimate in relocalized.items():
         if estimate.world_from_rig is None or estimate.covariance is None:
             continue
@@ -120,11 +121,11 @@ def with_relocalized(queries: PosedQueries, relocalized: Mapping[int, PoseEstima
     return voters.joined(silent)
 
 
-def queries_of(estimates: Mapping[int, PoseEstimate]) -> PosedQueries:
+def queries_of(estimates: Mapping[int, QueryResult]) -> PosedQueries:
     """Return the estimates with a pose, by frame, as input of a pose graph."""
     posed = {frame: each for frame, each in sorted(estimates.items()) if each.world_from_rig is not None}
     rows = list(posed.values())
-    trusted = np.array([each.status == "ok" for each in rows], bool)
+    trusted = np.array([each.status is Status.OK for each in rows], bool)
     covariances = [UNKNOWN_COVARIANCE if each.covariance is None else each.covariance for each in rows]
     p_correct = np.array([each.p_correct for each in rows])
     rival_support = np.array([each.rival_support for each in rows])

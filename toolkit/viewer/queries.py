@@ -14,8 +14,8 @@ from toolkit.capture.images import prefetch, read_for_display
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.figures.style import ESTIMATED, GREEN, MAP, ORANGE, SKY, TRUE, draw_error_legend, error_colors
 from toolkit.geometry import Floats, local_origin, project, shifted
+from toolkit.results.images import REFERENCES, Localizations, QueryDetails, ShownImage, support_of
 from toolkit.results.metrics import is_posed
-from toolkit.results.pair import REFERENCES, Localizations, QueryDetails, ShownImage, support_of
 from toolkit.viewer import blueprint as viewer
 
 if TYPE_CHECKING:

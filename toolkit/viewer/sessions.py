@@ -21,9 +21,9 @@ from toolkit.errors import ArtifactError, CaptureError, ImageError
 from toolkit.figures.style import ORANGE
 from toolkit.files import file_fingerprint, files_fingerprint, pair_devices, write_sidecar
 from toolkit.geometry import Floats, Ints, local_origin, shifted
-from toolkit.pose.correspondences import LocalizedQueries, LocalizedQuery
+from toolkit.results.images import sure_points
 from toolkit.results.metrics import is_posed
-from toolkit.results.pair import load_maps, map_files, sure_points
+from toolkit.results.pair import PairResults, load_maps, map_files
 from toolkit.viewer import blueprint as viewer
 
 if TYPE_CHECKING:
@@ -540,17 +540,17 @@ class _QueryPoses:
                 f"{path}: the references of its queries are in the h5 file of a pair, {prefix}<M>_query_<Q>.h5, but "
                 "this file is not named after a pair. Give the poses of a pair, or leave out vis_retrieve_queries."
             )
-        queries, map_session = LocalizedQueries(h5), capture[f"{map_device}_map"]
+        results, map_session = PairResults.open(h5), capture[f"{map_device}_map"]
         centers = map_session.world_from_cam()[:, :3, 3]
         center_of = dict(zip(map_session.image_names, centers, strict=True))
-        keys = zip(poses.timestamps.tolist(), poses.device_ids.tolist(), strict=True)
+        # The poses may be those of the sequence stage.
+        own = poses.lookup(results.table["timestamp"], results.table["device_id"])
         lines = [
             np.stack([pose[:3, 3], center_of[name]])
-            for key, pose in zip(keys, poses.world_from_device, strict=True)
-            for name in queries.get(key, LocalizedQuery()).references
-            if name in center_of
+            for result, pose in zip(results, own, strict=True)
+            for name in result.references
+            if name in center_of and is_posed(pose)
         ]
-        queries.close()
         return cls(poses, map_device, query_device, h5, lines)
 
 

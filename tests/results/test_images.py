@@ -15,7 +15,8 @@ from toolkit.geometry import make_pose
 from toolkit.mapping.local_map import LocalMap
 from toolkit.pose.correspondences import LocalizedQuery
 from toolkit.results import pair as localized
-from toolkit.results.pair import LocalizedPair, load_maps, map_files, sure_points
+from toolkit.results.images import LocalizedPair, sure_points
+from toolkit.results.pair import load_maps, map_files
 
 INLIERS = [True, False, True, True, False, True]
 

@@ -1,0 +1,271 @@
+"""Images of localized queries and of their references, with correspondences, as figures and the viewer draw them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from toolkit import geometry
+from toolkit.capture import Capture, Session
+from toolkit.geometry import Floats, Ints, invert
+from toolkit.mapping.local_map import LocalMap
+from toolkit.pose.result import Correspondences, QueryResult
+from toolkit.results.metrics import is_posed, pose_errors, worst_first
+from toolkit.results.pair import PairResults
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+REFERENCES = 4
+"""References shown per query, at most."""
+
+
+MAX_POINTS = 1_000_000
+"""Points of a map that are shown, at most: a viewer needs about 30 bytes for each."""
+
+
+def sure_points(local_map: LocalMap | None) -> tuple[Floats, NDArray[np.uint8] | None]:
+    """Return the points seen by at least three images, (P, 3), and their colors (P, 3) RGB; other points are noisy.
+
+    A large map is reduced to a regular sample of at most `MAX_POINTS`.
+    """
+    if local_map is None:
+        return np.zeros((0, 3)), None
+    sure = np.flatnonzero(np.diff(local_map.point_starts) >= 3)
+    sure = sure[:: -(-len(sure) // MAX_POINTS) or 1]
+    return local_map.points[sure], local_map.colors[sure]
+
+
+@dataclass(frozen=True)
+class ShownImage:
+    """A posed image and its correspondences."""
+
+    name: str
+    path: Path
+    camera: "pycolmap.Camera"
+    world_from_cam: Floats
+    """(4, 4); NaN if unknown."""
+    pixels: Floats = field(default_factory=lambda: np.zeros((0, 2)))
+    """(n, 2) measured keypoints, pixels of the full image."""
+    points: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    """(n, 3) map points, world, meters."""
+    matches: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(n,) numbers of the correspondences; pixels with the same number in two images match."""
+    inlier: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+    """(n,) whether each correspondence agrees with the pose."""
+    world_from_cam_true: Floats = field(default_factory=lambda: np.full((4, 4), np.nan))
+    """(4, 4); NaN if unknown."""
+    found_by: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, np.str_))
+    """(n,) how each correspondence was found, such as `sift/guided`."""
+
+    @property
+    def num_inliers(self) -> int:
+        return int(self.inlier.sum())
+
+    def shifted(self, offset: Floats) -> "ShownImage":
+        """Return the image in a world whose origin is shifted: `offset` (3,) is added to all positions."""
+        return replace(
+            self,
+            points=self.points + offset,
+            world_from_cam=geometry.shifted(self.world_from_cam, offset),
+            world_from_cam_true=geometry.shifted(self.world_from_cam_true, offset),
+        )
+
+
+_OF_A_MATCH = ("pixels", "points", "matches", "inlier", "found_by")
+
+
+@dataclass(frozen=True)
+class QueryDetails:
+    """Images and correspondences of one query."""
+
+    cameras: Sequence[ShownImage]
+    """Its images, at the estimated pose; the one with the most points that agree first."""
+    references: Sequence[ShownImage] = ()
+    """Map images that it was localized with, best first."""
+    rejected: Sequence[ShownImage] = ()
+    """References that contradict the references used."""
+
+    @property
+    def has_matches(self) -> bool:
+        """Whether the method matched keypoints, rather than used the poses of whole references."""
+        return any(len(camera.matches) for camera in self.cameras)
+
+    def shifted(self, offset: Floats) -> "QueryDetails":
+        """Return the images in a world whose origin is shifted, see `ShownImage.shifted`."""
+        groups = (self.cameras, self.references, self.rejected)
+        return QueryDetails(*([image.shifted(offset) for image in images] for images in groups))
+
+    def of_first_camera(self) -> "QueryDetails":
+        """Return the first image alone, and references with only its correspondences."""
+
+        def reduced(image: ShownImage) -> ShownImage:
+            chosen = np.isin(image.matches, self.cameras[0].matches)
+            return replace(image, **{name: getattr(image, name)[chosen] for name in _OF_A_MATCH})
+
+        return QueryDetails(self.cameras[:1], list(map(reduced, self.references)), self.rejected)
+
+    def captioned_references(self) -> list[tuple[ShownImage, str, bool]]:
+        """Return at most `REFERENCES` references, up to two of them rejected: image, caption, whether used."""
+        agree = [
+            (image, f"reference {rank}" + (f": sees {image.num_inliers} points" if self.has_matches else ""), True)
+            for rank, image in enumerate(self.references, start=1)
+        ]
+        rejected = [(image, "rejected: contradicts the others", False) for image in self.rejected]
+        return [*agree[: REFERENCES - min(2, len(rejected))], *rejected][:REFERENCES]
+
+
+def support_of(row: pd.Series) -> str:
+    """Return the support of the pose in a row of a pair's csv as text, such as `120 inliers`."""
+    # Older runs name the method `vggt`.
+    by_network = str(row.get("method", "")).rpartition("/")[2].startswith(("feed_forward", "vggt"))
+    return f"{row['num_inliers']:.0f} {'consistent references' if by_network else 'inliers'}"
+
+
+@dataclass(frozen=True)
+class Localizations:
+    """The queries of a pair, one row each; a rig is represented by its first image."""
+
+    names: Sequence[str]
+    table: pd.DataFrame
+    """The pair's csv, with at least the columns status and num_inliers."""
+    estimated: Floats
+    """world_from_cam (Q, 4, 4), NaN without a pose."""
+    true: Floats
+    """True world_from_cam (Q, 4, 4), NaN where unknown."""
+    nearest_reference: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    """World position (Q, 3) of the first reference of each query without a pose; else NaN."""
+    unit: tuple[str, float] = ("m", 1.0)
+    """Unit that lengths are shown in, see `metrics.length_unit`."""
+    cam_from_rig: Floats = field(default_factory=lambda: np.eye(4))
+    """(Q, 4, 4), or one (4, 4) for all."""
+
+    def shifted(self, offset: Floats) -> "Localizations":
+        """Return the queries in a world whose origin is shifted, see `ShownImage.shifted`."""
+        return replace(
+            self,
+            estimated=geometry.shifted(self.estimated, offset),
+            true=geometry.shifted(self.true, offset),
+            nearest_reference=self.nearest_reference + offset,
+        )
+
+    @cached_property
+    def ranked(self) -> pd.DataFrame:
+        """The table with the errors of the device: `rotation_error_deg`, and `translation_error_m`.
+
+        They equal those of the evaluation: infinite without a pose, NaN without ground truth. Lengths are in `unit`.
+        """
+        rotation_deg, translation = pose_errors(self.estimated @ self.cam_from_rig, self.true @ self.cam_from_rig)
+        table = self.table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation)
+        lengths = table.columns.intersection(["translation_error_m", "position_std_m"])
+        return table.assign(**table[lengths] / self.unit[1])
+
+    def worst_first(self) -> Ints:
+        """Return the rows from worst to best (`metrics.worst_first`)."""
+        return worst_first(self.ranked)
+
+
+@dataclass
+class LocalizedPair:
+    """The queries of a pair in their map. Images and correspondences of a query are read on demand."""
+
+    results: PairResults
+    """Of the queries with an image."""
+    map_session: Session
+    query_session: Session
+    rows: list[Ints]
+    """For each query, the rows of its images in the session."""
+    local_map: LocalMap | None
+    """The triangulated maps that the run used, pooled."""
+
+    @classmethod
+    def open(
+        cls, capture: Capture, map_device: str, query_device: str, poses_dir: str | Path, map_dir: str | Path | None
+    ) -> "LocalizedPair":
+        """Open the stored results of the localize stage for a pair.
+
+        Raises:
+            ArtifactError: the poses, their table or their correspondences are missing or torn.
+        """
+        session = capture[f"{query_device}_query"]
+        results = PairResults.of(poses_dir, capture.name, map_device, query_device)
+        rows = session.rows_of_keyframes(results.table)
+        has_image = np.array([len(images) > 0 for images in rows], bool)
+        results = replace(results, table=results.table[has_image].reset_index(drop=True))
+        _ = results.poses  # a missing file is reported here
+        images, local_map = [images for images in rows if len(images)], results.local_map(map_dir)
+        return cls(results, capture[f"{map_device}_map"], session, images, local_map)
+
+    @property
+    def name(self) -> str:
+        return self.results.path.stem
+
+    @cached_property
+    def localizations(self) -> Localizations:
+        session = self.query_session
+        first = np.array([rows[0] for rows in self.rows], np.int64)
+        rig_from_cam = session.rig_from_cam(first)
+        estimated = self.results.poses @ rig_from_cam
+        centers = np.full((len(first), 3), np.nan)
+        for k in np.flatnonzero(~is_posed(estimated)):
+            names = [name for name in self.results[int(k)].references if name in self.map_session.row_of_name]
+            if names:
+                centers[k] = self.map_session.world_from_cam([self.map_session.row_of_name[names[0]]])[0, :3, 3]
+        names = [session.image_name(int(row)) for row in first]
+        true = session.world_from_cam(first, ground_truth=True)
+        of_results = self.results.table, estimated, true, centers, self.results.unit
+        return Localizations(names, *of_results, invert(rig_from_cam))
+
+    def details(self, k: int, result: QueryResult | None = None) -> QueryDetails:
+        """Return images, correspondences and references of query k, as stored or of another result."""
+        session, rows = self.query_session, self.rows[k]
+        query = self.results[k] if result is None else result
+        pose = np.full((4, 4), np.nan) if query.world_from_rig is None else query.world_from_rig
+        poses = pose @ session.rig_from_cam(rows)
+        cameras = []
+        for row, pose in zip(rows.tolist(), poses, strict=True):
+            name = session.image_name(row)
+            matches = query.correspondences.in_camera(query.images.index(name) if name in query.images else -1)
+            pixels = query.correspondences.pixels[matches]
+            cameras.append(_shown_image(session, row, pose, query.correspondences, matches, pixels))
+        cameras.sort(key=lambda camera: -camera.num_inliers)
+        return QueryDetails(
+            cameras,
+            self._references(query, list(enumerate(query.references))),
+            self._references(query, [(-1, name) for name in query.rejected]),
+        )
+
+    def _references(self, query: QueryResult, names: Sequence[tuple[int, str]]) -> list[ShownImage]:
+        """Return the first few map images with their correspondences; `names` are (reference number, image name)."""
+        session, correspondences = self.map_session, query.correspondences
+        numbered_rows = [(number, session.row_of_name[name]) for number, name in names if name in session.row_of_name]
+        poses = session.world_from_cam([row for _, row in numbered_rows[:REFERENCES]])
+        images = []
+        for (number, row), pose in zip(numbered_rows, poses, strict=False):
+            views = np.flatnonzero(correspondences.view_reference == number)
+            matches, pixels = correspondences.view_of[views], correspondences.view_pixels[views]
+            images.append(_shown_image(session, row, pose, correspondences, matches, pixels))
+        return images
+
+
+def _shown_image(
+    session: Session, row: int, pose: Floats, correspondences: Correspondences, matches: Ints, pixels: Floats
+) -> ShownImage:
+    return ShownImage(
+        session.image_name(row),
+        session.image_path(row),
+        session.camera(str(session.images["sensor_id"].iloc[row])),
+        pose,
+        pixels,
+        correspondences.points[matches],
+        matches,
+        correspondences.inlier[matches],
+        session.world_from_cam([row], ground_truth=True)[0],
+        correspondences.found_by[matches],
+    )

@@ -1,0 +1,142 @@
+"""How a run localized: its settings, and messages about runs, scenes and devices that do not exist."""
+
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, TypeVar
+
+import h5py
+
+from toolkit.capture import Capture, Session
+from toolkit.errors import ArtifactError, ManifestError, ToolkitError
+from toolkit.features.matching import LocalMethod
+from toolkit.files import SceneFiles, file_fingerprint, fingerprint, pair_devices, write_atomic
+from toolkit.manifest import LocalizeSettings, Settings, nearest
+from toolkit.mapping.local_map import map_path
+from toolkit.results.pair import MAPS
+from toolkit.runs.record import RECORD
+from toolkit.store.hdf5 import HDF5_ERRORS
+
+SETTINGS, SESSIONS_ROOT, RETRIEVAL = "settings", "sessions_root", "retrieval_dir"
+"""Attributes of `poses/<pair>.h5`: the settings that the pair was localized with, the `sessions` folder of the capture,
+and the folder of the references."""
+
+
+def no_such_run(run: Path) -> str:
+    """Return a message that lists the runs beside a folder that is none."""
+    return f"{run}: no such run. {nearest(run.name, [path.parent.name for path in run.parent.glob(f'*/{RECORD}')])}"
+
+
+def localized_scenes(run: Path) -> list[str]:
+    """Return the names of the captures that a run has localized, in order."""
+    return sorted(path.parent.name for path in run.glob("*/poses"))
+
+
+def unknown(files: SceneFiles, device: str) -> str:
+    """Return a message that says which of run, scene and device is unknown, and lists the known ones."""
+    run = files.run
+    if not run.is_dir():
+        return no_such_run(run)
+    scenes = localized_scenes(run)
+    if files.scene not in scenes:
+        return f"{run}: no poses of the scene {files.scene!r}. {nearest(files.scene, scenes)}"
+    devices = {pair_devices(path.stem)[0] for path in files.poses_dir.glob("*.h5")}
+    return f"{files.poses_dir}: no poses of queries in the map of {device!r}. {nearest(device, devices)}"
+
+
+Localized = tuple[LocalizeSettings, dict[str, Any], list[str]]
+"""Settings that a pair was localized with, attributes of its `.h5` file, and the file names of its maps."""
+
+
+def how_localized(pair: Path) -> Localized:
+    """Return how the queries of a pair were localized.
+
+    Args:
+        pair: `poses/<pair>.h5`.
+
+    Raises:
+        ArtifactError: the file is missing, damaged, or lacks the attributes.
+    """
+    try:
+        with h5py.File(pair, "r") as file:
+            attributes = dict(file.attrs)
+            return LocalizeSettings.of(json.loads(attributes[SETTINGS])), attributes, json.loads(attributes[MAPS])
+    except ManifestError:
+        raise ArtifactError(f"{pair}: another version of the toolkit has localized it. Localize again.") from None
+    except (*HDF5_ERRORS, ToolkitError) as error:
+        raise ArtifactError(f"{pair}: cannot read how it was localized ({error}). Localize again.") from None
+
+
+def last_localized(files: SceneFiles, pairs: Sequence[Path]) -> Localized:
+    """Return how a pair of the last run was localized; pairs of earlier runs may have other settings.
+
+    The last run is known by its settings file. File times would be unreliable, as clocks can be set back.
+    """
+    last = None
+    with suppress(ArtifactError):  # the run is of a version that wrote no such file, or other settings
+        last = read_settings(files.poses_dir / "settings.json", LocalizeSettings)
+    localized, message = [], ""
+    for pair in pairs:
+        try:
+            localized.append(how_localized(pair))
+        except ArtifactError as error:
+            message = str(error)
+    if not localized:
+        raise ArtifactError(message)
+    return next((one for one in localized if one[0] == last), localized[-1])
+
+
+AnySettings = TypeVar("AnySettings", bound=Settings)
+
+
+def read_settings(path: Path, model: type[AnySettings]) -> AnySettings:
+    """Return the settings that a stage wrote beside its results.
+
+    Raises:
+        ArtifactError: the file is missing, damaged, or of another version.
+    """
+    try:
+        return model.of(json.loads(path.read_text(encoding="utf-8")))
+    except ManifestError:
+        raise ArtifactError(f"{path}: another version of the toolkit wrote it. Run the stage again.") from None
+    except (OSError, ValueError) as error:
+        raise ArtifactError(f"{path}: cannot read the settings of the stage ({error}). Run the stage again.") from None
+
+
+def session_fingerprint(session: Session) -> str:
+    """Return 16 hex digits that identify the calibration, poses and image list of a session."""
+    files = ["sensors.txt", "images.txt", "rigs.txt", "trajectories.txt"]
+    return fingerprint([file_fingerprint(session.path / name) for name in files if (session.path / name).exists()])
+
+
+def attributes(
+    settings: LocalizeSettings, kinds: Sequence[LocalMethod], capture: Capture, device: str, retrieval_dir: Path
+) -> dict[str, str]:
+    """Return the attributes of a pair's `.h5` file from which `Map.open` opens the map.
+
+    Args:
+        settings, kinds: those that the queries were localized with.
+        capture: the capture.
+        device: the map device.
+        retrieval_dir: folder of the references.
+    """
+    return {
+        MAPS: json.dumps([map_path("", f"{device}_map", kind.name).name for kind in kinds if settings.map is not None]),
+        SETTINGS: settings.model_dump_json(),
+        SESSIONS_ROOT: str(capture.path / "sessions"),
+        RETRIEVAL: str(retrieval_dir),
+    }
+
+
+def update_attributes(path: Path, attributes: Mapping[str, str]) -> bool:
+    """Update the attributes of a file if equivalent settings made it or its capture moved; tell if any changed."""
+    with h5py.File(path, "r") as file:
+        current = {name: file.attrs.get(name) for name in attributes} == dict(attributes)
+    if not current:
+        with write_atomic(path) as temporary:
+            shutil.copyfile(path, temporary)
+            with h5py.File(temporary, "a", libver="latest") as file:
+                file.attrs.update(attributes)
+    return not current
