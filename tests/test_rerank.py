@@ -406,7 +406,8 @@ def test_map_images_in_memory_are_bounded(monkeypatch: pytest.MonkeyPatch) -> No
             read.append(name)
             return features
 
-    verifier = verification.Verifier(RerankSettings(max_features=4), MutualMatcher(0.8), Store())
+    store = Store(dict.fromkeys("abc", features))
+    verifier = verification.Verifier(RerankSettings(max_features=4), MutualMatcher(0.8), store)
     for name in "ababcab":
         verifier.verify(features, WIDE, [name], [WIDE])
     assert read == ["a", "b", "c", "a", "b"]

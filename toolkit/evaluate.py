@@ -322,10 +322,11 @@ def _read_results(path: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
     status = np.where(located, Status.OK, Status.FAILED).astype(object)
     results = keys.assign(pose=list(poses), status=status, **dict.fromkeys(DETAILS, np.nan))
     table = path.with_suffix(".csv")
-    if not table.is_file():  # another tool writes only poses; then every pose counts as ok
-        return results, "evaluated"
     columns = ["timestamp", "device_id"]
     try:
+        require_whole(table, of=path)
+        if not table.is_file():  # another tool writes only poses; then every pose counts as ok
+            return results, "evaluated"
         details = PairResults.open(path).table.drop_duplicates(columns)
     except ArtifactError as error:
         return results, f"unreadable table of queries ({error})"

@@ -319,8 +319,8 @@ def _read_statuses(files: SceneFiles, messages: list[str]) -> pd.DataFrame:
     for path in pairs_of(files.poses_dir):
         try:
             results = PairResults.open(path)
-        except ArtifactError as error:
-            messages.append(str(error))
+        except ArtifactError:
+            messages.append(f"{path.name} cannot be read")
             continue
         table, devices = results.table.reindex(columns=STATUS_COLUMNS), results.devices
         tables.append(table.assign(map_device=devices[0], query_device=devices[1]))
