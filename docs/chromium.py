@@ -169,20 +169,23 @@ def _wait_for(url: str, server: "subprocess.Popen[bytes]", log: Path, seconds: f
 
 
 def copy_notebook(stage: str, run: Path, sessions_root: Path, folder: Path) -> str:
-    """Copy a stage's notebook to a folder, with parameters that name the files of a run; return its name."""
+    """Copy a stage's notebook to a folder, with parameters that name the files of a run; return its name.
+
+    Its results are a copy of the run's, beside it: a notebook may not write into a run.
+    """
     import nbformat
 
     from toolkit.files import SceneFiles
     from toolkit.notebook import notebook_parameters, notebook_path, stage_folders, stage_outputs
 
     source, files = notebook_path(stage), SceneFiles(run, sessions_root.parent.name)
-    places = {**stage_folders(files), "sessions_root": sessions_root, "out_dir": stage_outputs(files, stage)}
+    results = shutil.copytree(stage_outputs(files, stage), folder / "results")
+    places = {**stage_folders(files), "sessions_root": sessions_root, "out_dir": results}
     parameters = notebook_parameters(source)
     parameters |= {name: str(path) for name, path in places.items() if name in parameters}
     content = nbformat.read(source, as_version=4)
     cell = next(cell for cell in content.cells if "parameters" in cell.metadata.get("tags", []))
     cell.source = "\n".join(f"{name} = {value!r}" for name, value in parameters.items())
-    folder.mkdir(parents=True, exist_ok=True)
     nbformat.write(content, folder / source.name)
     return source.name
 

@@ -68,11 +68,15 @@ def test_colors_counts_and_shares() -> None:
 
 
 def test_a_copied_notebook_works_on_the_run(tmp_path: Path) -> None:
+    results = tmp_path / "run" / "PLACE" / "visualization"
+    results.mkdir(parents=True)
+    (results / "a.png").touch()
     name = chromium.copy_notebook("visualize", tmp_path / "run", tmp_path / "PLACE" / "sessions", tmp_path / "copies")
     parameters = notebook_parameters(tmp_path / "copies" / name)
     assert parameters["sessions_root"] == str(tmp_path / "PLACE" / "sessions")
     assert parameters["poses_dir"] == str(tmp_path / "run" / "PLACE" / "poses")
-    assert parameters["out_dir"] == str(tmp_path / "run" / "PLACE" / "visualization")
+    assert parameters["out_dir"] == str(tmp_path / "copies" / "results")
+    assert (tmp_path / "copies" / "results" / "a.png").is_file()
     assert parameters["map_device"] == "all"
 
 
