@@ -70,13 +70,12 @@ def run_stage(capture: Path, files: SceneFiles, **more: object) -> pd.DataFrame:
 
 @pytest.fixture(scope="module")
 def finished(
-    small_capture: Path, small_features: Path, tmp_path_factory: pytest.TempPathFactory
+    small_capture: Path, small_embedded: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[SceneFiles, pd.DataFrame]:
     """A run that has localized all devices in the phone's map, and its table; do not write to it."""
     files = SceneFiles(tmp_path_factory.mktemp("run"), small_capture.name)
-    copy_shared(small_features, files.features)
+    copy_shared(small_embedded, files.root)
     sessions = small_capture / "sessions"
-    embed_sessions(sessions, files.embeddings, features_dir=files.features)
     retrieve_pairs(sessions, files.embeddings, map_device="ios", out_jsonl=files.retrieval_dir, queries=LIST)
     return files, run_stage(small_capture, files)
 
