@@ -22,7 +22,7 @@ demo: $(INSTALLED)  ## render a small capture, localize all nine pairs, write a 
 run: $(INSTALLED)  ## run RUN_MANIFEST=data_manifests/<yours>.yaml
 	$(BIN)/python -m toolkit run $(RUN_MANIFEST)
 
-test: $(INSTALLED)  ## run the default tests, 4 to 8 minutes on 2 idle cores
+test: $(INSTALLED)  ## run the default tests, about 3 minutes on 2 idle cores
 	$(PYTEST)
 
 # An AVX2 laptop has the kernels of Haswell, a processor without AVX those of Prescott.
