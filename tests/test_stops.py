@@ -225,8 +225,9 @@ def test_an_error_in_a_cell_has_its_exit_code(place: Path, raised: str, code: in
     assert "Traceback (most recent call last)" in (place / "runs/run" / LOG).read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs signals")
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_the_run_its_kernels_and_sockets(place: Path, number: signal.Signals) -> None:
     code = "from pathlib import Path\nimport time, os\nPath(out_jsonl).parent.mkdir(parents=True, exist_ok=True)\n"
     code += "Path(out_jsonl).write_text(str(os.getpid()))\ntime.sleep(600)"
@@ -310,6 +311,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "--lazy", folder], check=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("used", [0, 60, 64])
 def test_a_disk_of_64_kb_is_told_in_a_sentence(
     here: Path, small_disk: Path, used: int, command: Callable[..., int], capsys: pytest.CaptureFixture[str]
