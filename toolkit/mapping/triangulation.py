@@ -167,8 +167,9 @@ class _Projections(NamedTuple):
             weighted = (weight[:, None, None] * jacobian).transpose(0, 2, 1)  # one einsum of all three is slower
             hessian = (weighted @ jacobian).reshape(-1, 9)
             gradient = (weighted @ error[:, :, None])[:, :, 0]
-            H = np.stack([np.bincount(point, h, count) for h in hessian.T], -1).reshape(-1, 3, 3)
-            g = np.stack([np.bincount(point, d, count) for d in gradient.T], -1)
+            # Without observations, bincount returns integers.
+            H = np.stack([np.bincount(point, h, count) for h in hessian.T], -1, dtype=np.float64).reshape(-1, 3, 3)
+            g = np.stack([np.bincount(point, d, count) for d in gradient.T], -1, dtype=np.float64)
             # A little damping keeps points with an uncertain depth from jumping.
             H += 1e-6 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
             points = points - np.linalg.solve(H, g[..., None])[..., 0]
