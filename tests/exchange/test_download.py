@@ -25,10 +25,9 @@ from tests.fake_hub import FakeHub, serving, use_hub
 from toolkit import pipeline
 from toolkit.capture import Capture
 from toolkit.errors import CaptureError, DownloadError, ManifestError, sentence
-from toolkit.exchange import archives, transfer
+from toolkit.exchange import archives
 from toolkit.exchange import download as module
-from toolkit.exchange.archives import unpack
-from toolkit.exchange.datasets import arrange
+from toolkit.exchange.archives import arrange, unpack
 from toolkit.exchange.download import download, is_unfinished
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -52,7 +51,7 @@ dataset:
 @pytest.fixture
 def hub(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FakeHub]:
     """A hub on this machine in place of the real one."""
-    monkeypatch.setattr(transfer, "_ATTEMPTS", 3)
+    monkeypatch.setattr(module, "MAX_ATTEMPTS", 3)
     monkeypatch.setattr("huggingface_hub.constants.DOWNLOAD_CHUNK_SIZE", 1 << 18)  # only whole chunks are kept
     with serving(FakeHub()) as server:
         use_hub(monkeypatch, server.url, tmp_path)
@@ -390,7 +389,7 @@ def test_parts_of_another_version_are_not_put_together(hub: FakeHub, manifest: P
 def test_a_large_file_is_asked_for_in_parts(
     hub: FakeHub, manifest: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(transfer, "_RANGE_BYTES", 300_000)
+    monkeypatch.setattr(module, "MAX_RANGE_BYTES", 300_000)
     download(manifest, ["ios_query"])
     assert found(manifest.parent) == session("ios_query")
     assert asked(hub) == ["bytes=0-", "bytes=300000-", "bytes=600000-"]

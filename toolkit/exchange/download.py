@@ -7,16 +7,22 @@
     partial/         files being fetched, named by a fingerprint of path and version
     archives/        complete archives waiting to be unpacked
     unpacked/        an archive being unpacked
+
+`hf_hub_download` of huggingface_hub 2.4 and `retrieve` of pooch 1.9 fetch to a random name that no later process finds.
+`http_get`, which `hf_hub_download` is made of, appends to the file that it is given, resumes when a connection breaks,
+and waits as long as a busy server asks.
 """
 
 import fnmatch
+import hashlib
 import json
 import os
 import re
 import shutil
+import time
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -25,9 +31,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
 from toolkit.errors import DownloadError, ManifestError, ToolkitError
-from toolkit.exchange.archives import FileError, require_space, safe_path, size_text, unpack
-from toolkit.exchange.datasets import arrange
-from toolkit.exchange.transfer import WHOLE, RemoteFile, fetch
+from toolkit.exchange.archives import FileError, arrange, require_space, safe_path, size_text, unpack
 from toolkit.files import fingerprint
 from toolkit.manifest import DatasetSettings, Source, load_manifest, nearest
 from toolkit.models.hub import failure_reason, status_of
@@ -36,6 +40,9 @@ if TYPE_CHECKING:
     from toolkit.capture.check import CheckReport
 
 STATE = ".download"
+WHOLE = {"Accept-Encoding": "identity"}  # for each request: a compressed response could not be resumed in the middle
+MAX_ATTEMPTS = 6  # in a row that bring no data, besides those of http_get
+MAX_RANGE_BYTES = 32 << 30  # per request: the hub's content network does not answer requests for 50 GB
 _WORKERS = 8  # threads for small files, which mostly wait for the network; archives are fetched one by one
 
 
@@ -104,6 +111,59 @@ def is_unfinished(capture: Path) -> bool:
     return any((capture / STATE).glob("unfinished-*"))
 
 
+@dataclass(frozen=True)
+class RemoteFile:
+    """A file to fetch."""
+
+    path: str
+    """Target path relative to the capture's folder, with `/`. An archive is unpacked into its parent folder."""
+    url: str
+    size: int
+    version: str
+    """Identifies the version of the file: its checksum, `sha256:...` or `git:...`, else `etag:...` of the server."""
+
+    @property
+    def is_archive(self) -> bool:
+        return self.path.lower().endswith(".zip")
+
+    def matches(self, local: Path) -> bool:
+        """Return whether a local file has the size of this file, and its checksum if that is known."""
+        if _size(local) != self.size:
+            return False
+        kind, _, expected = self.version.partition(":")
+        # git: SHA-1 of a header and the content, https://git-scm.com/book/en/v2/Git-Internals-Git-Objects
+        digests = {"sha256": hashlib.sha256, "git": lambda: hashlib.sha1(b"blob %d\0" % self.size)}
+        with open(local, "rb") as stream:
+            return kind not in digests or hashlib.file_digest(stream, digests[kind]).hexdigest() == expected
+
+    def fetch(self, partial: Path, headers: Mapping[str, str], bar: Any) -> None:
+        """Fetch the missing bytes to `partial`, which may hold the first ones already, and advance a tqdm bar.
+
+        Raises:
+            Exception: an error of the disk, of huggingface_hub, or of its HTTP client; `partial` stays.
+        """
+        from huggingface_hub.file_download import http_get
+
+        failures, before = 0, _size(partial) or 0
+        while True:
+            try:
+                with open(partial, "ab") as out:
+                    if before > self.size:
+                        out.truncate(0)
+                    while (have := out.seek(0, os.SEEK_END)) < self.size:
+                        end = min(have + MAX_RANGE_BYTES, self.size)
+                        asked = {**headers, **WHOLE, "Range": f"bytes=0-{end - 1}"}  # http_get adds `have`
+                        http_get(self.url, out, resume_size=have, headers=asked, expected_size=end, _tqdm_bar=bar)
+                return
+            except Exception as error:  # the type for a connection that broke depends on the HTTP client's version
+                now = _size(partial) or 0
+                failures, before = (1 if now > before else failures + 1), now
+                is_of_the_machine = isinstance(error, ConnectionError) or getattr(error, "errno", None) is not None
+                if failures == MAX_ATTEMPTS or is_of_the_machine or (status_of(error) or 500) < 500:
+                    raise
+                time.sleep(2**failures)
+
+
 @dataclass
 class _Capture:
     """The download of one capture: the files of its source, the state on disk, and the steps."""
@@ -117,10 +177,9 @@ class _Capture:
     say: Callable[..., None]
 
     def __post_init__(self) -> None:
-        self.state = self.folder / STATE
-        hub, page = self.source.hub, f"https://huggingface.co/datasets/{self.source.hub}"
+        self.state, hub = self.folder / STATE, self.source.hub
         self.origin = f"dataset {hub} ({self.source.revision})" if hub else ", ".join(self.source.urls)
-        self.page = page if hub else self.dataset.page
+        self.page = f"https://huggingface.co/datasets/{hub}" if hub else self.dataset.page
         self.files: list[RemoteFile] = []
         self.bar: Any = None
         self.done: set[tuple[str, str, str]] = set()
@@ -180,16 +239,15 @@ class _Capture:
         kind = FileError if status_of(error) in (404, 416) else DownloadError
         reason = failure_reason(error, self.page, ", ".join(self.source.urls))
         return kind(
-            f"{what}: {reason}.\nCheck the network, HTTPS_PROXY, HF_ENDPOINT and HF_HUB_OFFLINE; that you have access "
-            f"to {self.page} (for the hub, log in with `hf auth login`); and by {self.dataset.page} that "
-            f"`dataset.sources.{self.folder.name}` is right. Then run the same command: it resumes the download."
+            f"{what}: {reason}.\nCheck the network, HTTPS_PROXY, HF_ENDPOINT, HF_HUB_OFFLINE, access to {self.page} "
+            f"(for the hub: `hf auth login`), and `dataset.sources.{self.folder.name}` by {self.dataset.page}. Then "
+            "run the same command: it resumes the download."
         )
 
     def _wants(self, path: str) -> bool:
         """Return whether to download the file with this path in the capture."""
-        return any(_is_of(path, session) for session in self.names.values()) or any(
-            fnmatch.fnmatchcase(path, pattern) for pattern in self.dataset.include
-        )
+        included = any(fnmatch.fnmatchcase(path, pattern) for pattern in self.dataset.include)
+        return included or any(_is_of(path, session) for session in self.names.values())
 
     def describe(self, in_full: bool) -> None:
         """Print what is fetched, from where, and under which license; `in_full` lists each file."""
@@ -300,7 +358,7 @@ class _Capture:
         for path in (partial, target):
             path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            fetch(file, partial, build_hf_headers() if self.source.hub else {}, self.bar)  # the token
+            file.fetch(partial, build_hf_headers() if self.source.hub else {}, self.bar)  # the token
         except Exception as error:  # of the disk, the library, or its HTTP client, which depends on its version
             if getattr(error, "errno", None) is not None:
                 raise
@@ -312,8 +370,7 @@ class _Capture:
             partial.unlink()
             raise FileError(
                 f"{file.path}: wrong checksum, expected {file.version}; the fetched data were deleted. Run the same "
-                f"command again; if the error persists, the published file is damaged ({file.url}). Put a right one at "
-                f"{target}."
+                f"command again, or put a right file of {file.url} at {target}."
             )
         partial.replace(target)
 
