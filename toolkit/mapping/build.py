@@ -239,7 +239,7 @@ def _refined(given: "MapPlan", workers: int) -> "MapPlan":
     plan, depth = given, given.survey.typical_depth() / given.length
     focal_px = float(np.median([camera.mean_focal_length() for camera in given.cameras]))
     for _ in range(MAX_REFINEMENTS):
-        noise = plan.survey.noise(plan.length)
+        noise = plan.survey.pairs.noise(plan.length)
         noise_px = np.radians(noise.direction_deg(depth)) * focal_px
         if plan is given and noise_px < MIN_NOISE_PX:
             break
@@ -289,9 +289,7 @@ class MapPlan(Remade):
         self.rows = np.flatnonzero(posed & np.array([name in features for name in names], bool))
         """(N,) rows of the map images in the session."""
         if not len(self.rows):
-            raise ArtifactError(
-                f"Session {session.id} has no image with both a pose and local features: no map can be built."
-            )
+            raise ArtifactError(f"{session.id} has no image with a pose and local features: no map can be built.")
         self.world_from_cams = world_from_cams[self.rows]
         self.names = [names[row] for row in self.rows]
         self.cameras = session.cameras(self.rows)
@@ -306,9 +304,6 @@ class MapPlan(Remade):
         starts = np.searchsorted(self._home[self.pairs[order, 0]], np.arange(len(self.tiles) + 1))
         self.pairs_of = [self.pairs[np.sort(order[slice(*starts[tile : tile + 2])])] for tile in range(len(self.tiles))]
         """For each tile, the pairs whose first image is in its core."""
-        # What was just matched is not read again. Only for a map of one tile: those of several may not fit into memory.
-        self._matched: dict[tuple[int, int], Ints] = {}
-        self._keypoints_of: dict[int, NDArray[np.float32]] = {}
         self.matcher = _matcher_settings(self.kind, max(MAX_EPIPOLAR_ERROR_PX, least_limit_px))
 
     @cached_property
@@ -323,7 +318,7 @@ class MapPlan(Remade):
             self.groups,
             self.session.images["sensor_id"].to_numpy()[self.rows].tolist(),
         )
-        return Survey(surveyed, lambda index: self.features[self.names[index]], self.kind)
+        return Survey(surveyed, self._features_of, self.kind)
 
     @cached_property
     def of_worker(self) -> Any:
@@ -368,33 +363,16 @@ class MapPlan(Remade):
             todo = items.left((match_name(names[i], names[j]), made_from[i] + made_from[j], i, j) for i, j in pairs)
             label = f"match {self.session.id}" + (f" {number + 1}/{len(self.tiles)}" if len(self.tiles) > 1 else "")
             todo = items.spread(_match_share, todo, (self.of_worker,), label, "pair")
-            self.match_into(items, todo, workers, label if todo else "", keep=len(self.tiles) == 1)
+            self.match_into(items, todo, workers, label if todo else "")
 
-    def match_into(
-        self, items: Items, todo: Sequence[_ToMatch], workers: int, label: str, keep: bool = False
-    ) -> None:
-        """Add the matches of pairs to a folder; `keep` them in memory, too."""
-
-        def load(index: int) -> LocalFeatures:
-            features = self.features[self.names[index]]
-            if keep:
-                self._keypoints_of[index] = features.keypoints
-            return features
-
-        all_matches = match_pairs(
-            np.array([pair[2:] for pair in todo], np.int64).reshape(-1, 2),
-            load,
-            self.cameras,
-            self.world_from_cams,
-            self.matcher["max_error_px"],
-            self.kind,
-            workers,
-        )
-        bar = tqdm(all_matches, total=len(todo), desc=label, unit="pair", disable=not label)
-        for (name, source, i, j), matches in zip(todo, bar, strict=True):
-            write_matches(items, name, source, matches)
-            if keep:
-                self._matched[i, j] = matches.indices
+    def match_into(self, items: Items, todo: Sequence[_ToMatch], workers: int, label: str) -> None:
+        """Add the matches of pairs to a folder."""
+        pairs = np.array([pair[2:] for pair in todo], np.int64).reshape(-1, 2)
+        poses, max_error_px = self.world_from_cams, self.matcher["max_error_px"]
+        matches = match_pairs(pairs, self._features_of, self.cameras, poses, max_error_px, self.kind, workers)
+        bar = tqdm(matches, total=len(todo), desc=label, unit="pair", disable=not label)
+        for (name, source, _, _), matched in zip(todo, bar, strict=True):
+            write_matches(items, name, source, matched)
 
     def tile_path(self, number: int) -> Path:
         """Return the file of a tile, which is a map of its own."""
@@ -428,11 +406,6 @@ class MapPlan(Remade):
         pairs = self._pairs_in(number)
         stores = {tile: MatchStore(self._matches_path(tile)) for tile in np.unique(self._home[images]).tolist()}
 
-        def matches_of(i: int, j: int) -> Ints:
-            if (i, j) in self._matched:
-                return self._matched[i, j]
-            return stores[self._home[i]][self.names[i], self.names[j]].indices
-
         poses = self.world_from_cams[images]
         # In the unit of the poses: divided by the length, a shift by whole hundreds would no longer be one.
         origin = geometry.local_origin(self.world_from_cams[:, :3, 3])
@@ -442,7 +415,7 @@ class MapPlan(Remade):
             geometry.make_pose(poses[:, :3, :3], (poses[:, :3, 3] - origin) / self.length),
             [self.keypoints(image) for image in images],
             np.searchsorted(images, pairs),
-            [matches_of(i, j) for i, j in pairs.tolist()],
+            [stores[self._home[i]][self.names[i], self.names[j]].indices for i, j in pairs.tolist()],
             self.settings,
             self.seed,
             max(MAX_REPROJECTION_ERROR_PX, self._least_limit_px),
@@ -476,9 +449,11 @@ class MapPlan(Remade):
     def _save(self, local_map: LocalMap) -> None:
         local_map.judged(self.survey.consistency(local_map)).save(self.path)
 
+    def _features_of(self, image: int) -> LocalFeatures:
+        return self.features[self.names[image]]
+
     def keypoints(self, image: int) -> NDArray[np.float32]:
-        kept = self._keypoints_of.get(image)
-        return self.features[self.names[image]].keypoints if kept is None else kept
+        return self._features_of(image).keypoints
 
     def _colors(self, images: Ints, keypoints: Ints) -> NDArray[np.uint8]:
         """Return the colors (n, 3) at n keypoints of images; gray where an image cannot be read."""

@@ -329,9 +329,7 @@ class LocalMap:
                 **{name: arrays[name] for name in _ARRAYS},
             ).knowing(**{name: arrays[name] for name in ORDERS})
         except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile, struct.error) as error:
-            raise ArtifactError(
-                f"The triangulated map {path} cannot be read ({error}). Build it again with the localize stage."
-            ) from None
+            raise ArtifactError(f"The map {path} cannot be read ({error}). Build it again: localize.") from None
         return opened
 
 
