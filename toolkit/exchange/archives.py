@@ -125,10 +125,8 @@ def _split(old: Path, new: list[Path]) -> list[str]:
         own = {name for name in subsessions if name.startswith(f"{device}_")}
         unclaimed -= own
         if not own:
-            raise CaptureError(
-                f"{old.name}: expected subsessions of device {device!r}, named {device}_...; found "
-                f"{', '.join(sorted(subsessions)[:3]) or 'none'}. Remove {session.name} from dataset.sessions."
-            )
+            found = ", ".join(sorted(subsessions)[:3]) or "none"
+            raise CaptureError(f"{old.name}: expected subsessions of {device!r}, named {device}_...; found {found}.")
         for file, column in _KEY_COLUMNS.items():
             if (old / file).is_file():
                 (session / file).parent.mkdir(parents=True, exist_ok=True)

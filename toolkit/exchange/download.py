@@ -203,10 +203,8 @@ class _Capture:
         self.files = [file for file in listed if self.source.urls or self._wants(file.path)]
         if not self.files:
             folders = sorted({"/".join(file.path.split("/")[:2]) for file in listed})
-            raise DownloadError(
-                f"{self.folder.name}: {self.origin} has no file for {', '.join(self.names.values())}. It has "
-                f"{', '.join(folders[:20]) or 'nothing'}. Correct `dataset.sessions` or `dataset.into`."
-            )
+            found, asked = ", ".join(folders[:20]) or "nothing", ", ".join(self.names.values())
+            raise DownloadError(f"{self.folder.name}: {self.origin} has no file for {asked}. It has {found}.")
 
     def _list_hub(self, repo: str) -> Iterator[RemoteFile]:
         from huggingface_hub import HfApi, hf_hub_url
@@ -304,10 +302,8 @@ class _Capture:
         report = check_capture(self.folder)
         self.say("\n" + report.text(most=20))
         if missing := [name for name in self.names if name not in report.tables]:
-            raise DownloadError(
-                f"{self.folder}: {self.origin} is here, but there is no session {', '.join(missing)} in it; found "
-                f"{', '.join(report.tables)}. Correct `dataset.sessions`, or name those to download with --sessions."
-            )
+            found = f"there is no session {', '.join(missing)} in it; found {', '.join(report.tables)}"
+            raise DownloadError(f"{self.folder}: {self.origin} is here, but {found}. Correct `dataset.sessions`.")
         return report
 
     def _fetch_all(self) -> None:
@@ -326,10 +322,8 @@ class _Capture:
             errors = [*pool.map(self._obtain, [file for file in files if not file.is_archive])]
             errors += map(self._obtain, [file for file in files if file.is_archive])
         if failures := [str(error) for error in errors if error]:
-            raise DownloadError(
-                f"{self.folder.name}: {len(failures)} of {len(self.files)} files failed; the others are there. Run the "
-                "same command to try these again.\n  " + "\n  ".join(failures[:5])
-            )
+            some = f"{len(failures)} of {len(self.files)} files failed; the others are there. Run the command again."
+            raise DownloadError("\n  ".join([f"{self.folder.name}: {some}", *failures[:5]]))
         for mark in marks:
             mark.unlink()
         if not is_unfinished(self.folder):
@@ -368,10 +362,8 @@ class _Capture:
             raise self._failure(what, error) from error
         if not file.matches(partial):
             partial.unlink()
-            raise FileError(
-                f"{file.path}: wrong checksum, expected {file.version}; the fetched data were deleted. Run the same "
-                f"command again, or put a right file of {file.url} at {target}."
-            )
+            again = f"The data were deleted. Run the command again, or put a right file of {file.url} at {target}."
+            raise FileError(f"{file.path}: wrong checksum, expected {file.version}. {again}")
         partial.replace(target)
 
     def _unpack(self, file: RemoteFile, archive: Path) -> None:

@@ -9,7 +9,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -118,22 +118,20 @@ class Draft:
         self.rows += [{"image": name, "status": problem} for name, problem in problems.items() if problem]
         self.images = [image for image in self.images if not problems[image.name]]
         if not self.images:
-            why = f" First: {self.rows[0]['image']}: {self.rows[0]['status']}." if self.rows else ""
-            if self.rows and self.rows[0]["status"] in (NO_FILE, NOT_INSIDE):
-                why += " Names are paths in this folder: correct them in the list, or put the list beside the images."
-            raise CaptureError(f"{self.folder}: none of {len(self.rows)} images can be imported.{why}")
+            name, status = (self.rows[0]["image"], self.rows[0]["status"]) if self.rows else ("", "there is none")
+            where = " Names are paths in this folder: correct them in the list, or put the list beside the images."
+            why = f"First: {name}: {status}.{where if status in (NO_FILE, NOT_INSIDE) else ''}"
+            raise CaptureError(f"{self.folder}: none of {len(self.rows)} images can be imported. {why}")
 
     def write(self) -> ImportReport:
         """Write the session; call `leave_out` before."""
         if turned := sum(image.turned for image in self.images):
             self.notes.append(f"{turned} images have an EXIF orientation, which is ignored: pixels are used as stored")
         times = self._choose_times()
-        self.rows += [
-            {"image": image.name, "status": "imported", "path": image.path, "timestamp": times[image.frame],
-             "sensor_id": image.sensor, "device_id": image.device, "camera": camera_text(image.camera)}
-            for image in self.images
-        ]  # fmt: skip
         columns = ["image", "status", "path", "timestamp", "sensor_id", "device_id", "camera"]
+        for image in self.images:
+            values = image.path, times[image.frame], image.sensor, image.device, camera_text(image.camera)
+            self.rows.append(dict(zip(columns, (image.name, "imported", *values), strict=True)))
         table = pd.DataFrame(self.rows, columns=columns).astype({"timestamp": "Int64"})
         with write_folder(self.session) as session:
             for image in self.images:
@@ -187,13 +185,12 @@ class Draft:
             return str(error)
         orientation, camera = read_number(exif, ORIENTATION), image.camera
         image.turned, image.time_us = orientation > 1, time_taken(exif)
+        (width, height), sides = size, (*size, camera.width, camera.height)
         if size == (camera.width, camera.height):
             return ""
-        stored = f"{size[0]} x {size[1]}"
-        problem = f"the image is stored as {stored} pixels, its camera has {camera.width} x {camera.height}"
-        sides = (*size, camera.width, camera.height)
-        if abs(size[0] * camera.height - size[1] * camera.width) <= max(sides) / 2:  # equal ratio up to rounding
-            factor = size[0] / camera.width
+        problem = f"the image is stored as {width} x {height} pixels, its camera has {camera.width} x {camera.height}"
+        if abs(width * camera.height - height * camera.width) <= max(sides) / 2:  # equal ratio up to rounding
+            factor = width / camera.width
             problem += f"; use images of the camera's size, or multiply its intrinsics by {factor:.6g}"
         if orientation > 4 and size == (camera.height, camera.width):
             problem += "; the camera fits the rotated image: rotate the pixels and remove the EXIF orientation"
@@ -206,8 +203,8 @@ class Draft:
         if len(taken) == len(frames) == len(set(taken.values())):
             self.notes.append("timestamps: camera clock, from EXIF")
             return taken
-        why = "some images have no time" if len(taken) < len(frames) else "some images have the same time"
-        self.notes.append(f"timestamps: made up, one second apart in the order of the images ({why} in EXIF)")
+        why = f"some images have {'no' if len(taken) < len(frames) else 'the same'} time in EXIF"
+        self.notes.append(f"timestamps: made up, one second apart in the order of the images ({why})")
         return {frame: (number + 1) * 10**6 for number, frame in enumerate(frames)}
 
 
@@ -236,31 +233,25 @@ def write_drafts(*drafts: Draft) -> list[ImportReport]:
     return [draft.write() for draft in drafts]
 
 
-def list_images(folder: Path) -> pd.DataFrame:
-    """Return the images in and below a folder, sorted by name, as a table [image, line] with line 0.
-
-    Links to folders elsewhere are followed.
+def list_images(folder: Path) -> list[str]:
+    """Return the images in and below a folder, sorted by path. Links to folders elsewhere are followed, each once.
 
     Raises:
         CaptureError: there is no image.
     """
-    paths = sorted(path for path in _files_below(folder) if path.suffix.lower() in IMAGE_SUFFIXES)
-    if not paths:
-        raise CaptureError(f"{folder}: no image in or below it. Expected {', '.join(IMAGE_SUFFIXES)}.")
-    return pd.DataFrame({"image": [path.relative_to(folder).as_posix() for path in paths], "line": 0})
-
-
-def _files_below(folder: Path) -> Iterator[Path]:
-    """Yield the files in and below a folder. Links to folders elsewhere are followed, each target once."""
-    visited = [folder.resolve()]
-    for root, folders, names in os.walk(folder, followlinks=True):
+    visited, names = [folder.resolve()], list[str]()
+    for root, folders, files in os.walk(folder, followlinks=True):
         for link in [name for name in folders if Path(root, name).is_symlink()]:
             target = Path(root, link).resolve()
             if any(target.is_relative_to(path) or path.is_relative_to(target) for path in visited):
                 folders.remove(link)
             else:
                 visited.append(target)
-        yield from (Path(root, name) for name in names)
+        names += [Path(root, name).relative_to(folder).as_posix() for name in files]
+    names = sorted((name for name in names if name.lower().endswith(IMAGE_SUFFIXES)), key=Path)
+    if not names:
+        raise CaptureError(f"{folder}: no image in or below it. Expected {', '.join(IMAGE_SUFFIXES)}.")
+    return names
 
 
 def posed_camera(world_from_named: Floats, axes: str, unit_m: float) -> Floats:

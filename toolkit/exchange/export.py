@@ -97,10 +97,8 @@ def only_features(files: SceneFiles, session_id: str, kind: str) -> Path:
     folder = files.features / session_id
     stores = [path for path in sorted(folder.glob(f"{kind}-*")) if path.is_dir()]
     if len(stores) != 1:
-        raise ArtifactError(
-            f"{folder}: {len(stores)} folders of {kind} features, expected the one that the run localized with. Delete "
-            "this folder and run the localize stage again."
-        )
+        found = f"{len(stores)} folders of {kind} features, expected one"
+        raise ArtifactError(f"{folder}: {found}. Delete this folder and run the localize stage again.")
     return stores[0]
 
 
@@ -230,10 +228,8 @@ def export_pairs(
         query, *references = (_listed(image_name(name), names, path) for name in paths)
         pairs += [(query, reference) for reference in references]
     if shared := {query for query, _ in pairs} & {reference for _, reference in pairs}:
-        raise ArtifactError(
-            f"{path}: {min(shared)!r} is the name of a query and of a reference, which hloc cannot tell apart. Use "
-            "--names capture."
-        )
+        both = f"{min(shared)!r} is the name of a query and of a reference"
+        raise ArtifactError(f"{path}: {both}, which hloc cannot tell apart. Use --names capture.")
     return _write_list(out, pairs)
 
 
