@@ -115,12 +115,10 @@ def is_unfinished(capture: Path) -> bool:
 class RemoteFile:
     """A file to fetch."""
 
-    path: str
-    """Target path relative to the capture's folder, with `/`. An archive is unpacked into its parent folder."""
+    path: str  # target path relative to the capture's folder, with `/`. An archive is unpacked into its parent folder.
     url: str
     size: int
-    version: str
-    """Identifies the version of the file: its checksum, `sha256:...` or `git:...`, else `etag:...` of the server."""
+    version: str  # the checksum of the file, `sha256:...` or `git:...`, else `etag:...` of the server
 
     @property
     def is_archive(self) -> bool:
@@ -171,8 +169,7 @@ class _Capture:
     folder: Path
     dataset: DatasetSettings
     source: Source
-    names: dict[str, str]
-    """For each requested session, its name in the source."""
+    names: dict[str, str]  # for each requested session, its name in the source
     keep_archives: bool
     say: Callable[..., None]
 

@@ -43,10 +43,8 @@ class ImportReport:
     """The result of an import."""
 
     session: Path
-    images: pd.DataFrame
-    """One row per image: image, status (`imported` or why not), path, timestamp, sensor_id, device_id, camera."""
-    notes: list[str] = field(default_factory=list)
-    """Guesses, made-up values, and anything the user should look at."""
+    images: pd.DataFrame  # image, status (`imported` or why not), path, timestamp, sensor_id, device_id, camera
+    notes: list[str] = field(default_factory=list)  # guesses, made-up values, and anything the user should look at
 
     def text(self) -> str:
         """Return the report as text."""
@@ -67,12 +65,10 @@ class DraftImage:
     name: str
     camera: pycolmap.Camera
     sensor: str
-    frame: str
-    """Images with the same frame were taken at the same time."""
+    frame: str  # images with the same frame were taken at the same time
     rig: str | None = None
     time_us: int | None = None
-    turned: bool = False
-    """Whether the EXIF orientation says to rotate the image."""
+    turned: bool = False  # whether the EXIF orientation says to rotate the image
 
     @property
     def path(self) -> str:
@@ -89,21 +85,15 @@ class Draft:
     """A session being assembled."""
 
     session: Path
-    folder: Path
-    """Folder of the images."""
+    folder: Path  # folder of the images
     placing: str
     images: list[DraftImage] = field(default_factory=list)
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    """Rows of `proc/import.csv`."""
-    poses: dict[str, Floats] = field(default_factory=dict)
-    """world_from_device (4, 4) by frame; query frames may have none."""
-    rigs: list[tuple[str, str, Floats]] = field(default_factory=list)
-    """Rig, sensor, rig_from_sensor (4, 4)."""
-    unit: str | None = "m"
-    """Unit of the poses; None: unknown."""
+    rows: list[dict[str, Any]] = field(default_factory=list)  # rows of `proc/import.csv`
+    poses: dict[str, Floats] = field(default_factory=dict)  # world_from_device (4, 4) by frame; queries may have none
+    rigs: list[tuple[str, str, Floats]] = field(default_factory=list)  # rig, sensor, rig_from_sensor (4, 4)
+    unit: str | None = "m"  # unit of the poses; None: unknown
     notes: list[str] = field(default_factory=list)
-    sensors: dict[str, str] = field(default_factory=dict)
-    """Sensor id by `camera_text`, for images that are not in a rig."""
+    sensors: dict[str, str] = field(default_factory=dict)  # id by `camera_text`, for images that are not in a rig
 
     def add(self, name: str, camera: pycolmap.Camera, world_from_cam: Floats | None) -> None:
         """Add an image that is not in a rig. Images with equal intrinsics share a camera."""

@@ -31,13 +31,11 @@ FAILED = ("nearest", "leave-out")
 SCENES = {"HYDRO": "HYDRO", "SUCCULENT": "SUCCU"}
 """Captures of the CroCoDL challenge, with their names in its files; it asks for all pairs of `DEVICES`."""
 DEVICES = ["ios", "hl", "spot"]
-QUERIES = "keyframes_pruned_subsampled"
-"""The challenge's list of the query keyframes to be localized."""
+QUERIES = "keyframes_pruned_subsampled"  # the challenge's list of the query keyframes to be localized
 ORIGINS = {"ok": "ok", "low_confidence": "low_confidence", "nearest": "filled", "left out": "left_out"}
 """Where the pose of a query is from (the run, its nearest reference, or nowhere), and the name of the counts."""
 COUNTS = ["asked", "written", *ORIGINS.values(), "not_asked"]
-NOTED = ["left_out", "filled", "not_asked"]
-"""Counts that make a pair incomplete."""
+NOTED = ["left_out", "filled", "not_asked"]  # counts that make a pair incomplete
 
 COLUMNS_OF_QUERIES = ["file", "timestamp", "device_id", "pose", "reason"]
 Key = tuple[int, str]
@@ -49,12 +47,9 @@ class Submission:
 
     path: Path
     description: str
-    poses: dict[str, Trajectory]
-    """The poses of each pair that has some, by the name of its file."""
-    queries: pd.DataFrame
-    """One row per query of `COLUMNS_OF_QUERIES`; `pose` is a key of `ORIGINS`."""
-    table: pd.DataFrame
-    """One row per pair: file, the numbers of queries `COUNTS`, state (`complete`, or what is missing)."""
+    poses: dict[str, Trajectory]  # the poses of each pair that has some, by the name of its file
+    queries: pd.DataFrame  # one row per query of `COLUMNS_OF_QUERIES`; `pose` is a key of `ORIGINS`
+    table: pd.DataFrame  # one row per pair: file, the numbers `COUNTS`, state (`complete`, or what is missing)
 
     @property
     def missing(self) -> list[str]:

@@ -34,8 +34,7 @@ from toolkit.geometry import Floats
 
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE = "OPENCV_FISHEYE"
-TOLERANCE = 1e-3
-"""Largest deviation of R^T R from the identity, per element, that still counts as a rotation."""
+TOLERANCE = 1e-3  # largest deviation of R^T R from the identity, per element, that still counts as a rotation
 
 
 def import_transforms(

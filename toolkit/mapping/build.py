@@ -37,15 +37,12 @@ _ToMatch = tuple[str, str, int, int]
 """A pair to match: name of its item, fingerprint of the inputs of the matches, indices of the two images."""
 DEPTHS = (2.0, 4.0, 8.0, 16.0)
 """Depths at which the views of two images are compared, in map lengths (meters; see `Survey.length`)."""
-MAX_EPIPOLAR_ERROR_PX = 4.0
-"""Largest distance of a match from its epipolar line, on either side, pixels."""
-RATIO = 0.9
-"""Threshold of Lowe's ratio test among the candidates along the epipolar line."""
+MAX_EPIPOLAR_ERROR_PX = 4.0  # largest distance of a match from its epipolar line, on either side, pixels
+RATIO = 0.9  # threshold of Lowe's ratio test among the candidates along the epipolar line
 MAX_REFINEMENTS = 3  # rounds of bundle adjustment
 MIN_NOISE_PX = 1.0  # noise of the direction to points of the map, pixels, from which poses are refined
 NOISE_LIMIT = 4.0  # limits of a map whose poses are refined, in multiples of the noise of the direction to its points
-_MAP_FORMAT = 6
-"""Increase when the same settings give another file, so that existing maps are built again."""
+_MAP_FORMAT = 6  # increase when the same settings give another file, so that existing maps are built again
 
 
 def select_pairs(

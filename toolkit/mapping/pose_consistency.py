@@ -30,38 +30,27 @@ from toolkit.mapping.local_map import OPENGL_AXES, Consistency, LocalMap
 from toolkit.mapping.pose_noise import SurveyedPairs, VerifiedPair
 from toolkit.threads import fixed_sums
 
-ANCHORS = 12
-"""Number of images, evenly spread over the map, that are matched with their neighbors."""
-MAX_FEATURES = 1024
-"""Number of features that are matched per image, the strongest ones."""
+ANCHORS = 12  # number of images, evenly spread over the map, that are matched with their neighbors
+MAX_FEATURES = 1024  # number of features that are matched per image, the strongest ones
 MIN_MATCHES = 24
 """Fewest verified matches of a pair that counts; few pairs of different places that look alike have as many."""
-MIN_PAIRS = 5
-"""Fewest verified pairs for a verdict on a map."""
+MIN_PAIRS = 5  # fewest verified pairs for a verdict on a map
 MAX_ERROR_DEG = 1.0
 """Largest median angle between the rays of a pair's matches and their epipolar planes. Good poses have some hundredths
 of a degree, poses in another convention tens of degrees."""
-MIN_PARALLAX_DEG = 0.5
-"""Least angle between two rays that tells whether their point is in front of the cameras."""
+MIN_PARALLAX_DEG = 0.5  # least angle between two rays that tells whether their point is in front of the cameras
 MAX_ROTATION_ERROR_DEG = 5.0
 """Largest median difference between the relative rotations of poses and matches under a convention that fits."""
-MAX_TRIED = 12
-"""Number of pairs that conventions are tried with, those with the most matches."""
-CLEAR = 0.75
-"""Share of agreeing pairs from which no further convention is tried."""
-COARSE_DEG = 3.0
-"""Largest median error of correct but coarse poses."""
-COARSE_ROTATION_DEG = 10.0
-"""Largest median error of their relative rotations."""
+MAX_TRIED = 12  # number of pairs that conventions are tried with, those with the most matches
+CLEAR = 0.75  # share of agreeing pairs from which no further convention is tried
+COARSE_DEG = 3.0  # largest median error of correct but coarse poses
+COARSE_ROTATION_DEG = 10.0  # largest median error of their relative rotations
 NOISE = 20.0
 """Error of an image, in multiples of the median error, from which its pose is wrong; but at least 0.3 degrees."""
-WEAK = 0.3
-"""Images with less than this share of the median number of shared points are checked individually."""
-MAX_WEAK = 8
-"""Largest number of images that are checked individually, so that the effort does not grow with the map."""
+WEAK = 0.3  # images with less than this share of the median number of shared points are checked individually
+MAX_WEAK = 8  # largest number of images that are checked individually, so that the effort does not grow with the map
 
-NOMINAL_DEPTH = 10.0
-"""Median depth to which a map with poses of unknown unit is scaled for the localizers."""
+NOMINAL_DEPTH = 10.0  # median depth to which a map with poses of unknown unit is scaled for the localizers
 USUAL_DEPTHS_M = (2.0, 16.0)
 """Range of median depths for which the limits of the localizers, in meters, apply unchanged."""
 
@@ -71,14 +60,10 @@ class SurveyedImages(NamedTuple):
 
     names: Sequence[str]
     cameras: Sequence[pycolmap.Camera]
-    world_from_rigs: Floats
-    """(N, 4, 4)"""
-    rig_from_cams: Floats
-    """(N, 4, 4)"""
-    instants: Ints
-    """(N,) number of the instant; images that a rig took at the same time share it."""
-    sensors: Sequence[str]
-    """(N,) sensor ids."""
+    world_from_rigs: Floats  # (N, 4, 4)
+    rig_from_cams: Floats  # (N, 4, 4)
+    instants: Ints  # (N,) number of the instant; images that a rig took at the same time share it
+    sensors: Sequence[str]  # (N,) sensor ids
 
     @property
     def world_from_cams(self) -> Floats:
@@ -100,8 +85,7 @@ class Survey:
         self._matcher = MutualMatcher.of(kind)
         self._load = lru_cache(maxsize=64)(lambda index: load(index).take(slice(MAX_FEATURES)))
         self._verified = lru_cache(maxsize=None)(self._verify)
-        self.sample = self.verify(_sampled_pairs(images))
-        """Verified pairs all over the map."""
+        self.sample = self.verify(_sampled_pairs(images))  # verified pairs all over the map
 
     def verify(self, pairs: Iterable[tuple[int, int]]) -> list[VerifiedPair]:
         """Return the covisible ones of pairs of images, by their matches alone."""

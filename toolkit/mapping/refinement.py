@@ -14,8 +14,7 @@ from toolkit.mapping.pose_noise import PoseNoise
 
 MIN_OBSERVATIONS = 12  # of an image; with fewer, its pose stays as it is
 MAX_ITERATIONS = 50
-PRIOR_NOISE = 3.0
-"""Standard deviation of a given position, in multiples of the measured noise, which misses slow drift."""
+PRIOR_NOISE = 3.0  # standard deviation of a given position, in multiples of the measured noise, which misses slow drift
 LEAST_NOISE = PoseNoise(0.02, 0.001)  # one of the two may be zero
 MAX_ALIGNED = 50  # images by which the refined map is put where the given one was
 

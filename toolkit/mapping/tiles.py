@@ -18,17 +18,14 @@ from toolkit.geometry import Floats, Ints
 from toolkit.mapping.local_map import LocalMap
 from toolkit.mapping.triangulation import refine_points
 
-OPEN_TILES = 16
-"""Number of tiles whose files are open at once during joining."""
+OPEN_TILES = 16  # number of tiles whose files are open at once during joining
 
 
 class Tile(NamedTuple):
     """Images that are triangulated together."""
 
-    core: Ints
-    """(n,) core images, ascending; each image of the map is in the core of one tile."""
-    images: Ints
-    """(m,) core images and the images matched with them, ascending."""
+    core: Ints  # (n,) core images, ascending; each image of the map is in the core of one tile
+    images: Ints  # (m,) core images and the images matched with them, ascending
 
 
 def plan_tiles(positions: Floats, pairs: Ints, max_core: int) -> list[Tile]:
@@ -75,12 +72,9 @@ class JoinedImages(NamedTuple):
 
     names: list[str]
     cameras: list[pycolmap.Camera]
-    world_from_cams: Floats
-    """(N, 4, 4)"""
-    keypoints: Callable[[int], NDArray[np.float32]]
-    """Returns the keypoints (n, 2) of an image, pixels."""
-    colors: Callable[[Ints, Ints], NDArray[np.uint8]]
-    """Returns the colors (n, 3) at n keypoints, given their image indices and keypoint indices."""
+    world_from_cams: Floats  # (N, 4, 4)
+    keypoints: Callable[[int], NDArray[np.float32]]  # returns the keypoints (n, 2) of an image, pixels
+    colors: Callable[[Ints, Ints], NDArray[np.uint8]]  # returns the colors (n, 3) at n keypoints of n images
 
 
 def join_tiles(

@@ -14,10 +14,8 @@ from toolkit.geometry import Floats, Ints
 from toolkit.manifest import MapSettings
 from toolkit.mapping.local_map import LocalMap
 
-_CHUNK = 2048
-"""Number of points that are refined at once, so that their observations fit into the processor's cache."""
-_MIN_DEPTH = 1e-3
-"""Smallest depth of a point in front of a camera, map lengths."""
+_CHUNK = 2048  # number of points that are refined at once, so that their observations fit into the processor's cache
+_MIN_DEPTH = 1e-3  # smallest depth of a point in front of a camera, map lengths
 MAX_REPROJECTION_ERROR_PX = 4.0
 """Observations with a larger reprojection error, in pixels, are removed from a point's track."""
 
@@ -118,14 +116,10 @@ def _tracks(
 class RefinedPoints(NamedTuple):
     """Points that minimize the reprojection errors of their observations."""
 
-    points: Floats
-    """(P, 3) in the world."""
-    observations: Ints
-    """(n, 3) image, keypoint and point."""
-    error2: float
-    """Sum of the squared reprojection errors of the observations, square pixels."""
-    freedom: int
-    """Degrees of freedom of `error2`."""
+    points: Floats  # (P, 3) in the world
+    observations: Ints  # (n, 3) image, keypoint and point
+    error2: float  # sum of the squared reprojection errors of the observations, square pixels
+    freedom: int  # degrees of freedom of `error2`
 
     @property
     def noise_px(self) -> float:
