@@ -419,7 +419,7 @@ def test_images_without_features_or_pose_are_left_out(phone: tuple[Session, Feat
     local_map = build_map(session, partial, tmp_path / "ios_map.npz")
     assert sorted(local_map.image_names) == sorted(partial)
     assert 0 < len(partial) < len(session.images)
-    with pytest.raises(ArtifactError, match="Session ios_map has no image with both"):
+    with pytest.raises(ArtifactError, match="ios_map has no image with a pose and local features"):
         build_map(session, FeatureStore(store.path, {}), tmp_path / "other.npz")
 
 

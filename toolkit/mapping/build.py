@@ -46,12 +46,8 @@ _MAP_FORMAT = 6  # increase when the same settings give another file, so that ex
 
 
 def select_pairs(
-    world_from_cams: Floats,
-    cameras: Sequence[pycolmap.Camera],
-    groups: Ints,
-    per_image: int = 20,
-    length: float = 1.0,
-) -> Ints:
+    world_from_cams: Floats, cameras: Sequence[pycolmap.Camera], groups: Ints, per_image: int = 20, length: float = 1.0,
+) -> Ints:  # fmt: skip
     """Choose the image pairs of a map that are worth matching, from the poses alone.
 
     A pair is good if the cameras see the same part of the scene at an angle that triangulates well. The depth of the
@@ -110,14 +106,9 @@ def instants(session: Session, rows: Ints) -> Ints:
 
 
 def match_pairs(
-    pairs: Ints,
-    load: Callable[[int], LocalFeatures],
-    cameras: Sequence[pycolmap.Camera],
-    world_from_cams: Floats,
-    max_error_px: float = MAX_EPIPOLAR_ERROR_PX,
-    kind: FeatureKind = KINDS["sift"],
-    workers: int = 1,
-) -> Iterator[PairMatches]:
+    pairs: Ints, load: Callable[[int], LocalFeatures], cameras: Sequence[pycolmap.Camera], world_from_cams: Floats,
+    max_error_px: float = MAX_EPIPOLAR_ERROR_PX, kind: FeatureKind = KINDS["sift"], workers: int = 1,
+) -> Iterator[PairMatches]:  # fmt: skip
     """Match the features of image pairs with known poses along epipolar lines.
 
     Args:
@@ -177,17 +168,10 @@ def _kind_of(features: FeatureStore) -> FeatureKind:
 
 @fixed_sums
 def build_map(
-    session: Session,
-    features: FeatureStore,
-    path: str | Path,
-    settings: MapSettings | None = None,
-    seed: int = 0,
-    skip_existing: bool = True,
-    inputs: str = "",
-    workers: int = 1,
-    metric: bool = True,
+    session: Session, features: FeatureStore, path: str | Path, settings: MapSettings | None = None, seed: int = 0,
+    skip_existing: bool = True, inputs: str = "", workers: int = 1, metric: bool = True,
     poses: Mapping[str, Floats] | None = None,
-) -> LocalMap:
+) -> LocalMap:  # fmt: skip
     """Triangulate the map of a session with its known poses, or open the one at `path` if it is current.
 
     A map of more than `settings.tile_images` images is built in tiles. Matches and tiles are stored beside it, so a
@@ -262,24 +246,17 @@ class MapPlan(Remade):
     """The work of building a map: its images, the pairs to match, and the tiles to triangulate."""
 
     def __init__(
-        self,
-        session: Session,
-        features: FeatureStore,
-        path: Path,
-        settings: MapSettings,
-        seed: int = 0,
-        metric: bool = True,
-        length: float | None = None,
-        poses: Mapping[str, Floats] | None = None,
-        least_limit_px: float = 0.0,
-    ):
+        self, session: Session, features: FeatureStore, path: Path, settings: MapSettings, seed: int = 0,
+        metric: bool = True, length: float | None = None, poses: Mapping[str, Floats] | None = None,
+        min_limit_px: float = 0.0,
+    ):  # fmt: skip
         """See `build_map`; `length` is the survey's length if it is known, which saves the survey.
 
-        Limits of errors in pixels are at least `least_limit_px`.
+        Limits of errors in pixels are at least `min_limit_px`.
         """
         self.session, self.features, self.path, self.settings, self.seed = session, features, path, settings, seed
         names, world_from_cams = session.image_names, session.world_from_cam()
-        self._poses, self._least_limit_px = poses, least_limit_px
+        self._poses, self._min_limit_px = poses, min_limit_px
         for name, pose in (poses or {}).items():
             world_from_cams[session.row_of_name[name]] = pose
         posed = np.isfinite(world_from_cams).reshape(-1, 16).all(axis=1)
@@ -301,40 +278,31 @@ class MapPlan(Remade):
         starts = np.searchsorted(self._home[self.pairs[order, 0]], np.arange(len(self.tiles) + 1))
         self.pairs_of = [self.pairs[np.sort(order[slice(*starts[tile : tile + 2])])] for tile in range(len(self.tiles))]
         """For each tile, the pairs whose first image is in its core."""
-        self.matcher = _matcher_settings(self.kind, max(MAX_EPIPOLAR_ERROR_PX, least_limit_px))
+        self.keypoints = lru_cache(maxsize=512)(lambda image: self._features_of(image).keypoints)
+        self.matcher = _matcher_settings(self.kind, max(MAX_EPIPOLAR_ERROR_PX, min_limit_px))
 
     @cached_property
     def survey(self) -> Survey:
         """Survey of the poses, from a sample of image pairs."""
         rig_from_cams = self.session.rig_from_cam(self.rows)
-        surveyed = SurveyedImages(
-            self.names,
-            self.cameras,
-            self.world_from_cams @ geometry.invert(rig_from_cams),
-            rig_from_cams,
-            self.groups,
-            self.session.images["sensor_id"].to_numpy()[self.rows].tolist(),
-        )
-        return Survey(surveyed, self._features_of, self.kind)
+        world_from_rigs = self.world_from_cams @ geometry.invert(rig_from_cams)
+        sensors = self.session.images["sensor_id"].to_numpy()[self.rows].tolist()
+        images = SurveyedImages(self.names, self.cameras, world_from_rigs, rig_from_cams, self.groups, sensors)
+        return Survey(images, self._features_of, self.kind)
 
     @cached_property
     def of_worker(self) -> Any:
         """This plan for a worker, which gets the length and so needs no survey."""
-        arguments = (self.session, self.features, self.path, self.settings, self.seed)
-        more = {"length": self.length, "poses": self._poses, "least_limit_px": self._least_limit_px}
-        return MapPlan.elsewhere(*arguments, **more)
+        more = {"length": self.length, "poses": self._poses, "min_limit_px": self._min_limit_px}
+        return MapPlan.elsewhere(self.session, self.features, self.path, self.settings, self.seed, **more)
 
     def with_poses(
-        self, world_from_cams: Floats, path: Path, settings: MapSettings, least_limit_px: float = 0.0
+        self, world_from_cams: Floats, path: Path, settings: MapSettings, min_limit_px: float = 0.0
     ) -> "MapPlan":
         """Return the plan of the same map with other poses (N, 4, 4) of its images, file and settings."""
-        poses = dict(zip(self.names, world_from_cams, strict=True))
-        plan = MapPlan(
-            *(self.session, self.features, path, settings, self.seed),
-            length=self.length,
-            poses=poses,
-            least_limit_px=least_limit_px,
-        )
+        more: dict[str, Any] = {"length": self.length, "min_limit_px": min_limit_px}
+        more["poses"] = dict(zip(self.names, world_from_cams, strict=True))
+        plan = MapPlan(self.session, self.features, path, settings, self.seed, **more)
         plan.survey = self.survey.with_poses(world_from_cams)
         return plan
 
@@ -415,7 +383,7 @@ class MapPlan(Remade):
             [stores[self._home[i]][self.names[i], self.names[j]].indices for i, j in pairs.tolist()],
             self.settings,
             self.seed,
-            max(MAX_REPROJECTION_ERROR_PX, self._least_limit_px),
+            max(MAX_REPROJECTION_ERROR_PX, self._min_limit_px),
         ).scaled(self.length)
         points = local_map.points + origin
         local_map = replace(local_map, world_from_cams=poses, points=points, length=self.length)
@@ -448,9 +416,6 @@ class MapPlan(Remade):
 
     def _features_of(self, image: int) -> LocalFeatures:
         return self.features[self.names[image]]
-
-    def keypoints(self, image: int) -> NDArray[np.float32]:
-        return self._features_of(image).keypoints
 
     def _colors(self, images: Ints, keypoints: Ints) -> NDArray[np.uint8]:
         """Return the colors (n, 3) at n keypoints of images; gray where an image cannot be read."""

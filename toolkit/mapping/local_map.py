@@ -310,7 +310,7 @@ class LocalMap:
                 **{name: arrays[name] for name in _ARRAYS},
             ).knowing(**{name: arrays[name] for name in ORDERS})
         except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile, struct.error) as error:
-            raise ArtifactError(f"The map {path} cannot be read ({error}). Build it again: localize.") from None
+            raise ArtifactError(f"The map {path} cannot be read ({error}). Run the localize stage again.") from None
         return opened
 
 

@@ -21,16 +21,10 @@ MAX_REPROJECTION_ERROR_PX = 4.0
 
 
 def triangulate(
-    names: Sequence[str],
-    cameras: Sequence[pycolmap.Camera],
-    world_from_cams: Floats,
-    keypoints: Sequence[NDArray[np.float32]],
-    pairs: Ints,
-    matches: Sequence[Ints],
-    settings: MapSettings | None = None,
-    seed: int = 0,
-    max_error_px: float = MAX_REPROJECTION_ERROR_PX,
-) -> LocalMap:
+    names: Sequence[str], cameras: Sequence[pycolmap.Camera], world_from_cams: Floats,
+    keypoints: Sequence[NDArray[np.float32]], pairs: Ints, matches: Sequence[Ints], settings: MapSettings | None = None,
+    seed: int = 0, max_error_px: float = MAX_REPROJECTION_ERROR_PX,
+) -> LocalMap:  # fmt: skip
     """Triangulate points from matches between images with known poses, which are kept fixed.
 
     COLMAP's triangulator builds the tracks. The points are then refined here, all at once: with fixed poses, each point
@@ -164,14 +158,9 @@ def _gauss_newton(
 
 
 def refine_points(
-    points: Floats,
-    observations: Ints,
-    cameras: Sequence[pycolmap.Camera],
-    world_from_cams: Floats,
-    keypoints: Sequence[NDArray[np.float32]],
-    max_error_px: float = MAX_REPROJECTION_ERROR_PX,
-    iterations: int = 8,
-) -> RefinedPoints:
+    points: Floats, observations: Ints, cameras: Sequence[pycolmap.Camera], world_from_cams: Floats,
+    keypoints: Sequence[NDArray[np.float32]], max_error_px: float = MAX_REPROJECTION_ERROR_PX, iterations: int = 8,
+) -> RefinedPoints:  # fmt: skip
     """Minimize the reprojection errors of each point under a Cauchy loss of 1 px, by Gauss-Newton on all at once.
 
     Errors are measured on the undistorted image plane, times the focal length. Observations with a larger error than
