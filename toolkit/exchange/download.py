@@ -4,8 +4,7 @@
 
     unfinished-*     one for each session whose download has started and not finished
     done.jsonl       files that were fetched, verified and unpacked, one JSON object per line
-    partial/         files being fetched, named by a fingerprint of path and version
-    archives/        complete archives waiting to be unpacked
+    partial/         files being fetched and archives to be unpacked, named by a fingerprint of path and version
     unpacked/        an archive being unpacked
 
 `hf_hub_download` of huggingface_hub 2.4 and `retrieve` of pooch 1.9 fetch to a random name that no later process finds.
@@ -22,7 +21,7 @@ import shutil
 import time
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -49,20 +48,18 @@ _WORKERS = 8  # threads for small files, which mostly wait for the network; arch
 def download(
     manifest_path: str | Path,
     sessions: Sequence[str] = (),
-    keep_archives: bool = False,
     dry_run: bool = False,
     overrides: Iterable[str] = (),
-    say: Callable[..., None] = print,
 ) -> "list[CheckReport]":
-    """Download the captures of a manifest into their folders and check them. Files already there are not fetched again.
+    """Download the captures of a manifest into their folders, check them, and print what is done.
+
+    Files already there are not fetched again.
 
     Args:
         manifest_path: YAML file with `captures` and a section `dataset`, see `toolkit.manifest`.
         sessions: download only these sessions of the manifest; default: all.
-        keep_archives: keep archives in `<capture>/.download/archives` after unpacking.
         dry_run: list what would be fetched, and write nothing.
         overrides: `key=value` or `section.key=value`, in place of the manifest's values.
-        say: called with each line of the report, like `print`.
 
     Returns:
         The check report of each capture; empty on a dry run.
@@ -82,9 +79,9 @@ def download(
     captures = []
     for folder in map(Path, manifest.captures):
         if source := dataset.sources.get(folder.name):
-            captures.append(_Capture(folder, dataset, source, names, keep_archives, say))
+            captures.append(_Capture(folder, dataset, source, names))
         else:
-            say(f"{folder.name}: nothing is fetched. dataset.sources: {nearest(folder.name, dataset.sources)}")
+            print(f"{folder.name}: nothing is fetched. dataset.sources: {nearest(folder.name, dataset.sources)}")
     if not captures:
         raise ManifestError(f"{manifest_path}: dataset.sources has no entry for any folder in `captures`.")
     needed_bytes: Counter[Path] = Counter()
@@ -170,8 +167,6 @@ class _Capture:
     dataset: DatasetSettings
     source: Source
     names: dict[str, str]  # for each requested session, its name in the source
-    keep_archives: bool
-    say: Callable[..., None]
 
     def __post_init__(self) -> None:
         self.state, hub = self.folder / STATE, self.source.hub
@@ -247,10 +242,10 @@ class _Capture:
     def describe(self, in_full: bool) -> None:
         """Print what is fetched, from where, and under which license; `in_full` lists each file."""
         data, size = self.dataset, f"{len(self.files)} files, {size_text(sum(file.size for file in self.files))}"
-        self.say(f"{self.folder.name}: {self.origin}\n  to       {self.folder}\n  size     {size}")
-        self.say(f"  license  {data.license}\n  cite     {data.citation or '-'}\n  about    {data.page}")
+        print(f"{self.folder.name}: {self.origin}\n  to       {self.folder}\n  size     {size}")
+        print(f"  license  {data.license}\n  cite     {data.citation or '-'}\n  about    {data.page}")
         for file in self.files if in_full else ():
-            self.say(f"    {size_text(file.size):>9}  {file.path}")
+            print(f"    {size_text(file.size):>9}  {file.path}")
 
     # What is on disk
 
@@ -260,10 +255,9 @@ class _Capture:
         return own or [*self.names] if file.is_archive else [""]
 
     def _places(self, file: RemoteFile) -> tuple[Path, Path]:
-        """Return where a file is fetched to, and where it is put; the former depends on its version."""
+        """Return where a file is fetched to, and where it is put, or for an archive, unpacked from."""
         partial = self.state / "partial" / fingerprint([file.path, file.version])
-        archive = self.state / "archives" / f"{PurePosixPath(file.path).stem}-{partial.name}.zip"
-        return partial, archive if file.is_archive else self.folder / file.path
+        return partial, partial if file.is_archive else self.folder / file.path
 
     def _is_done(self, file: RemoteFile) -> bool:
         """Return whether this version of a file, or what an archive was unpacked to, is in place already."""
@@ -278,9 +272,8 @@ class _Capture:
         files = [file for file in self.files if not self._is_done(file)]
         have = [next((size for size in map(_size, reversed(self._places(file))) if size), 0) for file in files]
         # Images hardly shrink in an archive, so its size estimates the unpacked size. `unpack` checks the exact one.
-        packed = [file.size for file in files if file.is_archive and unpacked]
-        more = sum(packed) if self.keep_archives else max(packed, default=0)
-        return sum(max(0, file.size - size) for file, size in zip(files, have, strict=True)) + more
+        packed = max((file.size for file in files if file.is_archive and unpacked), default=0)
+        return sum(max(0, file.size - size) for file, size in zip(files, have, strict=True)) + packed
 
     # Fetch the files
 
@@ -297,7 +290,7 @@ class _Capture:
         except Timeout:
             raise DownloadError(f"{self.folder}: another download into this folder is running. Wait for it.") from None
         report = check_capture(self.folder)
-        self.say("\n" + report.text(most=20))
+        print("\n" + report.text(most=20))
         if missing := [name for name in self.names if name not in report.tables]:
             found = f"there is no session {', '.join(missing)} in it; found {', '.join(report.tables)}"
             raise DownloadError(f"{self.folder}: {self.origin} is here, but {found}. Correct `dataset.sessions`.")
@@ -339,7 +332,7 @@ class _Capture:
         row = {"path": file.path, "version": file.version, "sessions": self._sessions_in(file)}
         with open(self.state / "done.jsonl", "a", encoding="utf-8") as stream:  # one write, so threads need no lock
             stream.write("\n" + json.dumps(row))  # newline first: a kill may have cut off the previous line
-        if file.is_archive and not self.keep_archives:
+        if file.is_archive:
             target.unlink()
         return None
 
@@ -378,7 +371,7 @@ class _Capture:
             unpack(archive, unpacked, target_path, file.path)
             if isinstance(self.dataset.sessions, dict):
                 for note in arrange(unpacked / "sessions", self.dataset.sessions):
-                    self.say(f"{self.folder.name}: left out of {note}")
+                    print(f"{self.folder.name}: left out of {note}")
                 for name in self.dataset.sessions.keys() - self.names.keys():  # split off but not requested
                     shutil.rmtree(unpacked / "sessions" / name, ignore_errors=True)
             shutil.copytree(unpacked, self.folder, copy_function=os.replace, dirs_exist_ok=True)

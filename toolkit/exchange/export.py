@@ -140,11 +140,9 @@ def colmap_model(
             image = pycolmap.Image(_exported(name, names), keypoints[name].astype(np.float64), camera_id, member + 1)
             image.frame_id = frame_id
             model.add_image(image)
-    order = np.argsort(local_map.obs_point, kind="stable")
-    starts = np.searchsorted(local_map.obs_point[order], np.arange(len(local_map.points) + 1))
     for point, (xyz, color) in enumerate(zip(local_map.points, local_map.colors, strict=True)):
         track = pycolmap.Track()
-        for obs in order[starts[point] : starts[point + 1]]:
+        for obs in local_map.by_point[slice(*local_map.point_starts[point : point + 2])]:
             track.add_element(int(local_map.obs_image[obs]) + 1, int(local_map.obs_keypoint[obs]))
         model.add_point3D(xyz, track, color)
     model.update_point_3d_errors()

@@ -47,13 +47,9 @@ _CAMERA_COLUMNS = ("model", "width", "height", "params")
 
 
 def import_colmap(
-    model: str | Path,
-    images: str | Path,
-    capture: str | Path,
-    device: str = "ios",
-    split: str = "map",
+    model: str | Path, images: str | Path, capture: str | Path, device: str = "ios", split: str = "map",
     placing: str = "link",
-) -> ImportReport:
+) -> ImportReport:  # fmt: skip
     """Make a session from a COLMAP model and its images: cameras, poses, and the rigs that have several cameras.
 
     The capture format supports all camera models of COLMAP, so they are kept without undistortion. Points and tracks
@@ -95,19 +91,10 @@ def import_colmap(
 
 
 def import_images(
-    images: str | Path,
-    capture: str | Path,
-    device: str = "ios",
-    split: str = "query",
-    table: str | Path | None = None,
-    poses_are: str = "world_from_cam",
-    camera: str | None = None,
-    cameras: str | Path | None = None,
-    placing: str = "link",
-    axes: str = "opencv",
-    unit_m: float = 1.0,
-    truth: str | Path | None = None,
-) -> ImportReport:
+    images: str | Path, capture: str | Path, device: str = "ios", split: str = "query", table: str | Path | None = None,
+    poses_are: str = "world_from_cam", camera: str | None = None, cameras: str | Path | None = None,
+    placing: str = "link", axes: str = "opencv", unit_m: float = 1.0, truth: str | Path | None = None,
+) -> ImportReport:  # fmt: skip
     """Make a session from a folder of images without rigs.
 
     Intrinsics come from the table, else from `cameras`, else from `camera`, else they are guessed from each image's
@@ -190,10 +177,13 @@ def import_once(
     inputs["files of images"] = files_fingerprint([Path(images) / name for name in list_images(Path(images))])
     record = session / IMPORT_RECORD
     if not session.exists():
-        if _is_transforms(options.get("table")):
-            poses_are = options.get("poses_are", POSE_DIRECTIONS[0])
-            _require_own_folder(Path(images), Path(options["table"]), split, poses_are)
-            report = import_transforms(options["table"], capture, device, split, unit_m=unit_m)[0]
+        file = options.get("table")
+        if file is not None and _is_transforms(file):
+            if Path(images).resolve() != Path(file).resolve().parent:
+                raise ManifestError(f"{split}_images: found {images}, expected the folder of {file}.")
+            if (found := options.get("poses_are", POSE_DIRECTIONS[0])) != POSE_DIRECTIONS[0]:
+                raise ManifestError(f"poses_are: found {found!r}, expected world_from_cam, the direction in {file}.")
+            report = import_transforms(file, capture, device, split, unit_m=unit_m)[0]
         else:
             report = import_images(images, capture, device, split, unit_m=unit_m or 1.0, **options)
         unknown = {"unit": None} if unit_m is None else {}
@@ -214,14 +204,6 @@ def import_once(
 
 def _is_transforms(table: str | Path | None) -> bool:
     return table is not None and Path(table).suffix == ".json"
-
-
-def _require_own_folder(images: Path, file: Path, split: str, poses_are: str) -> None:
-    """Raise ManifestError unless a transforms.json is in the folder of images and its poses are world_from_cam."""
-    if images.resolve() != file.resolve().parent:
-        raise ManifestError(f"{split}_images: found {images}, expected the folder of {file}: its paths start there.")
-    if poses_are != POSE_DIRECTIONS[0]:
-        raise ManifestError(f"poses_are: found {poses_are!r}, expected world_from_cam, the direction in {file}.")
 
 
 _PROBE = """

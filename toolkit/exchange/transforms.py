@@ -38,15 +38,9 @@ TOLERANCE = 1e-3  # largest deviation of R^T R from the identity, per element, t
 
 
 def import_transforms(
-    path: str | Path,
-    capture: str | Path,
-    device: str = "ios",
-    split: str = "map",
-    placing: str = "link",
-    axes: str = "opengl",
-    unit_m: float | None = None,
-    hold_out: int = 0,
-) -> list[ImportReport]:
+    path: str | Path, capture: str | Path, device: str = "ios", split: str = "map", placing: str = "link",
+    axes: str = "opengl", unit_m: float | None = None, hold_out: int = 0,
+) -> list[ImportReport]:  # fmt: skip
     """Make a session, or a map and a query session, from a transforms.json. Images keep their `file_path` as names.
 
     Args:
