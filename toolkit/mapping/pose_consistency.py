@@ -154,12 +154,13 @@ class Survey:
             )
             if fits or (share < 0.5 and too_coarse):
                 return replace(result, verdict="inconsistent", fits=fits)
-        noise = self.pairs.noise(local_map.length)
+        pairs = self.pairs
+        noise = pairs.noise(local_map.length)
         return replace(
             result,
             verdict="consistent",
             wrong=self._wrong_images(local_map),
-            camera=self.pairs.misfit(self.images.cameras),
+            camera=pairs.misfit(self.images.cameras),
             rotation_noise_deg=round(noise.rotation_deg, 4),
             position_noise=round(noise.position, 6),
             direction_noise_deg=round(noise.direction_deg(self.typical_depth() / local_map.length), 4),
@@ -342,10 +343,9 @@ def _conventions(
             # Mirroring world and cameras along one axis gives rotations about other axes, and negated positions.
             mirrored = np.trace(X) == -1 and np.array_equal(X, np.diag(np.diag(X))) and np.array_equal(A, -np.eye(3))
             moved = not mirrored and not np.array_equal(A, np.eye(3))
+            direction = ("", "translations", "rotations", "poses")[2 * inverse + translations]
             texts = [
-                ("", "translations of cam_from_world", "rotations of cam_from_world", "poses of cam_from_world")[
-                    2 * inverse + translations
-                ],
+                f"{direction} of cam_from_world" if direction else "",
                 rigs_text,
                 "quaternions in the order x, y, z, w" if order else "",
                 "a mirrored world" if mirrored else _axes_text(X),
