@@ -61,21 +61,17 @@ class Consistency:
             )  # fmt: skip
             if OPENGL_AXES in self.fits:
                 cause += " If imported: give the other `--axes`, opencv or opengl, to `python -m toolkit import`."
-            return (
-                f"the poses of the map contradict its images: {self.agreeing} of {self.pairs} image pairs with "
-                f"verified matches agree with the poses. {cause}"
-            )
+            agree = f"{self.agreeing} of {self.pairs} image pairs with verified matches agree with the poses"
+            return f"the poses of the map contradict its images: {agree}. {cause}"
         if self.camera:
             return f"the intrinsics of the map contradict its images: {self.camera}. Correct them and localize again"
         if self.wrong:
             names = ", ".join(self.wrong[:8]) + (f" and {len(self.wrong) - 8} more" if len(self.wrong) > 8 else "")
             return f"{len(self.wrong)} map images have poses that contradict the others: {names}"
         if self.verdict == "unknown":
-            agree = f", {self.agreeing} of which agree with them" if self.pairs else ""
-            return (
-                "too few matches to tell whether the poses of the map are right "
-                f"({self.pairs} verified image pairs{agree})"
-            )
+            found = f"{self.pairs} verified image pairs"
+            found += f", {self.agreeing} of which agree with them" if self.pairs else ""
+            return f"too few matches to tell whether the poses of the map are right ({found})"
         return ""
 
 
@@ -240,19 +236,10 @@ class LocalMap:
         image = np.concatenate(images)
         point = np.concatenate([one.obs_point + start for one, start in zip(maps, starts[:-1], strict=True)])
         order = np.argsort(image, kind="stable")
-        pooled = cls(
-            image_names=names,
-            cameras=cameras,
-            world_from_cams=poses,
-            points=np.concatenate([one.points for one in maps]),
-            colors=np.concatenate([one.colors for one in maps]),
-            obs_image=image[order],
-            obs_keypoint=np.concatenate([one.obs_keypoint for one in maps])[order],
-            obs_point=point[order],
-            noise_px=np.concatenate([one.noise_px for one in maps]),
-            length=first.length,
-            consistency=first.consistency,
-        )
+        names_of = ("points", "colors", "obs_keypoint", "noise_px")
+        joined = {name: np.concatenate([getattr(one, name) for one in maps]) for name in names_of}
+        joined |= {"obs_image": image[order], "obs_keypoint": joined["obs_keypoint"][order], "obs_point": point[order]}
+        pooled = replace(first, image_names=names, cameras=cameras, world_from_cams=poses, **joined)
         return pooled._sharing(first) if same else pooled
 
     def judged(self, consistency: Consistency) -> "LocalMap":
