@@ -245,7 +245,6 @@ def download(
         str, typer.Option(metavar="NAME,...", help="Only these sessions of the manifest, e.g. ios_map,hl_query.")
     ] = "",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List files and sizes; fetch nothing.")] = False,
-    keep_archives: Annotated[bool, typer.Option("--keep-archives", help="Keep archives after unpacking.")] = False,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Replace a setting, as for `run`.")
     ] = None,
@@ -254,7 +253,7 @@ def download(
     from toolkit.exchange.download import download
 
     names = [name.strip() for name in sessions.split(",") if name.strip()]
-    reports = download(manifest, names, keep_archives, dry_run, overrides or ())
+    reports = download(manifest, names, dry_run, overrides or ())
     if not all(report.ok for report in reports):
         raise typer.Exit(1)
 
