@@ -554,18 +554,12 @@ def execute(
     if kernels is None:
         with Kernels(output.parent) as own:
             return execute(path, output, parameters, progress, own)
-    memory, kernel = MemoryWatch(), kernels.take()
+    kernel, memory, partial = kernels.take(), MemoryWatch(), output.with_name(f".{output.stem}.partial.ipynb")
     # Imported here because that takes seconds, which a run that reuses everything does not need.
     import papermill
-    from jupyter_client.kernelspec import NoSuchKernel
-    from nbclient.exceptions import DeadKernelError
-    from nbformat.reader import NotJSONError
     from papermill.exceptions import PapermillExecutionError
 
-    partial = output.with_name(f".{output.stem}.partial.ipynb")
-    alive = False
     try:
-        kernel.started.result()
         notebook = papermill.execute_notebook(
             # papermill formats paths with the parameters, so braces in them need escaping.
             *(str(file).replace("{", "{{").replace("}", "}}") for file in (path, partial)),
@@ -574,26 +568,22 @@ def execute(
             progress_bar=False,
             stderr_file=progress,
             km=kernel.manager,
+            coalesce_streams=True,
         )
-        alive = True
     except PapermillExecutionError as error:
-        alive = True
         raise _cell_error(error, output) from None
-    except (DeadKernelError, RuntimeError, NoSuchKernel) as error:
+    except RuntimeError as error:  # also nbclient's `DeadKernelError`
         raise kernel_error(error, kernel.ended_by, memory.stop(), output) from error
     except KeyboardInterrupt:
         # Otherwise asyncio prints tracebacks for the tasks that are left behind.
         logging.getLogger("asyncio").setLevel(logging.CRITICAL)
         raise
     finally:
-        kernels.end(kernel, by_force=not alive)
+        kernels.end(kernel)
         memory.stop()
-        if partial.exists():
-            try:
-                _tidy_streams(partial)
-                partial.replace(output)
-            except NotJSONError:  # cut short by the error that is being raised, e.g. a full disk
-                partial.unlink()
+        if read_json(partial):
+            partial.replace(output)
+        partial.unlink(missing_ok=True)  # cut short by the error that is being raised, e.g. a full disk
     return notebook, memory.stop()
 
 
@@ -617,27 +607,6 @@ def _cell_error(error: "PapermillExecutionError", output: Path) -> StageError:
     if text := shortage(error.ename, error.evalue) or shortage("", "\n".join(re.findall(r"errno.*", trace, re.I))):
         return StageError(f"{text}{where}")
     return StageError(f"{errors.BUG}{error.ename}: {error.evalue}. This is a bug.{where}", internal=True)
-
-
-def _tidy_streams(path: Path) -> None:
-    """Join the pieces of each output stream of an executed notebook, and drop text that a carriage return overwrote."""
-    import nbformat
-
-    content = nbformat.read(path, as_version=4)
-    for cell in content.cells:
-        outputs: list[Any] = []
-        for output in cell.get("outputs", []):
-            if output.output_type == "stream" and outputs and outputs[-1].get("name") == output.name:
-                outputs[-1].text += output.text
-            else:
-                outputs.append(output)
-        for output in outputs:
-            if output.output_type == "stream":
-                lines = output.text.split("\n")
-                output.text = "\n".join(line.rstrip("\r").rpartition("\r")[2] for line in lines)
-        if "outputs" in cell:
-            cell.outputs = outputs
-    nbformat.write(content, path)
 
 
 def work_seconds(notebook: Any) -> float:

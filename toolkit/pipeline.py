@@ -339,7 +339,7 @@ def _check_stages(manifest: Manifest, manifest_path: str | Path) -> None:
 
 
 def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: bool, say: Say, kernels: Kernels) -> None:
-    captures = _captures(manifest, kernels)
+    captures = _captures(manifest)
     every = [
         job
         for capture in captures
@@ -509,14 +509,12 @@ def _weights_needed(stage: str, settings: Settings) -> list[tuple[WeightsSource,
     return needed
 
 
-def _captures(manifest: Manifest, kernels: Kernels | None = None) -> list[Path]:
-    """Return the folders of the captures; render that of `demo_data`, while a kernel starts."""
+def _captures(manifest: Manifest) -> list[Path]:
+    """Return the folders of the captures; render that of `demo_data`."""
     if manifest.demo_data is not None:
         from toolkit.synthetic import render_capture
 
         folder = Path(manifest.output_root).parent / "data" / manifest.name
-        if kernels is not None and not folder.exists():
-            kernels.prepare()
         return [render_capture(folder, **manifest.demo_data.model_dump())]
     return [Path(capture) for capture in manifest.captures]
 
