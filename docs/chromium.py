@@ -173,10 +173,10 @@ def copy_notebook(stage: str, run: Path, sessions_root: Path, folder: Path) -> s
     import nbformat
 
     from toolkit.files import SceneFiles
-    from toolkit.notebook import notebook_parameters, notebook_path, stage_folders, stage_outputs
+    from toolkit.notebook import notebook_parameters, notebook_path
 
     source, files = notebook_path(stage), SceneFiles(run, sessions_root.parent.name)
-    places = {**stage_folders(files), "sessions_root": sessions_root, "out_dir": stage_outputs(files, stage)}
+    places = {**files.folders(stage), "sessions_root": sessions_root}
     parameters = notebook_parameters(source)
     parameters |= {name: str(path) for name, path in places.items() if name in parameters}
     content = nbformat.read(source, as_version=4)

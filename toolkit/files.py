@@ -12,7 +12,7 @@ import re
 import secrets
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -295,13 +295,8 @@ def require_current(artifact: str | Path, stage: str, suffixes: Iterable[str] = 
         raise ArtifactError(f"{Path(artifact).parent}: {why}")
 
 
-def older_files(folder: str | Path, stage: str, of: Callable[[str], bool] = lambda name: True) -> dict[str, str]:
-    """Return the files below a folder that are older than what they were made from, and why.
-
-    Args:
-        folder: folder of a stage's results.
-        stage: that stage.
-        of: selects artifacts by their path in the folder.
+def older_files(folder: str | Path, stage: str) -> dict[str, str]:
+    """Return the files of a stage below its folder that are older than what they were made from, and why.
 
     Returns:
         The sentence of `why_older`, by path in the folder, for all files of these artifacts.
@@ -309,8 +304,9 @@ def older_files(folder: str | Path, stage: str, of: Callable[[str], bool] = lamb
     older: dict[str, str] = {}
     for record in sorted(Path(folder).rglob("*.meta.json")):
         artifact = record.with_name(record.name.removesuffix(".meta.json"))
-        name = artifact.relative_to(folder).as_posix()
-        if of(name) and (why := why_older(artifact, stage, missing=stage not in ("retrieve", "rerank", "localize"))):
+        if stage in ("localize", "sequence") and of_sequence(artifact.name) != (stage == "sequence"):
+            continue  # the two write to one folder
+        if why := why_older(artifact, stage, missing=stage not in ("retrieve", "rerank", "localize")):
             files = _read_record(artifact).get("files", {})
             older |= {artifact.with_name(file).relative_to(folder).as_posix(): why for file in (artifact.name, *files)}
     return older
@@ -335,12 +331,6 @@ def _content(path: str | Path) -> str | None:
         return recorded if recorded and Path(path).stat().st_size == size else checksum(path)
     except (OSError, TypeError, ValueError, AttributeError, csv.Error):
         return None
-
-
-def any_unfinished(folder: str | Path, of: Callable[[str], bool]) -> bool:
-    """Tell whether any artifact below a folder, selected by its path in the folder, is recorded as unfinished."""
-    records = (path for path in Path(folder).rglob("*.meta.json") if of(path.relative_to(folder).as_posix()))
-    return any(_read_record(path.with_name(path.name.removesuffix(".meta.json"))).get("unfinished") for path in records)
 
 
 def _read_record(path: str | Path) -> dict[str, Any]:
@@ -406,6 +396,31 @@ class SceneFiles:
         self.poses_dir = self.root / "poses"
         self.evaluation = self.root / "evaluation"
         self.visualization = self.root / "visualization"
+
+    def of_stage(self, stage: str) -> Path | None:
+        """Return the folder of a stage's results; None if the stage writes only its executed notebook."""
+        return {
+            "embed": self.embeddings,
+            "retrieve": self.retrieval_dir,
+            "rerank": self.reranked_dir,
+            "localize": self.poses_dir,
+            "sequence": self.poses_dir,
+            "evaluate": self.evaluation,
+            "visualize": self.visualization,
+        }.get(stage)
+
+    def folders(self, stage: str) -> dict[str, Path]:
+        """Return the folders through which stages exchange results, by the names of the notebooks' parameters."""
+        out = self.of_stage(stage)
+        return {
+            "map_feats_root": self.embeddings,
+            "out_jsonl": self.retrieval_dir,
+            "retrieval_dir": self.retrieval_dir,
+            "features_dir": self.features,
+            "map_dir": self.maps,
+            "poses_dir": self.poses_dir,
+            **({"out_dir": out} if out else {}),
+        }
 
     def retrieval(self, map_device: str, query_device: str) -> Path:
         return self.retrieval_dir / f"{pair_name(self.scene, map_device, query_device)}.jsonl"

@@ -11,15 +11,16 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tqdm.auto
 import tqdm.std
+from pydantic import ConfigDict, Field, NonNegativeInt, ValidationError, create_model
 
 from toolkit import errors
-from toolkit.errors import CaptureError, ManifestError, StageError, shortage
+from toolkit.errors import ManifestError, StageError, shortage
 from toolkit.files import SceneFiles, files_fingerprint, link_folder, older_files, read_json, write_text
 from toolkit.manifest import (
     OPTIONAL,
@@ -32,10 +33,10 @@ from toolkit.manifest import (
     Settings,
     nearest,
 )
-from toolkit.runs.folder import LOG_VARIABLE, log_to
+from toolkit.manifest.messages import explain
+from toolkit.runs.folder import LOG_VARIABLE, RECORD, log_to
 from toolkit.runs.kernel import TEXT_BARS, Kernels, MemoryWatch, kernel_error
 from toolkit.runs.pairs import left_out_of
-from toolkit.runs.record import RECORD
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -123,15 +124,13 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
     files = SceneFiles(root / "runs" / f"{scene}-by-hand", scene)
     if None in folders.values():
         _take_from_run(stage, files)
-    defaults = {**stage_folders(files), "out_dir": stage_outputs(files, stage)}
+    defaults = files.folders(stage)
     _make_upstream(stage, sessions, files, {defaults[name] for name, folder in folders.items() if folder is None})
     resolved = {"sessions_root": sessions}
     for name, folder in folders.items():
-        path = Path(folder).expanduser().resolve() if folder else defaults[name]
-        if path is not None:
-            if folder and run_log is None and defaults[name] == defaults["out_dir"]:
-                _require_outside_of_runs(name, path, sessions)
-            resolved[name] = path
+        resolved[name] = Path(folder).expanduser().resolve() if folder else defaults[name]
+        if folder and run_log is None and defaults[name] == files.of_stage(stage):
+            _require_outside_of_runs(name, resolved[name], sessions)
     return Folders(resolved, stage)
 
 
@@ -264,32 +263,6 @@ def check_parameters(path: Path, parameters: Iterable[str], where: str = "") -> 
             raise ManifestError(f"{where}{name}: {path.name} has no such parameter. {nearest(name, known)}")
 
 
-def stage_folders(files: SceneFiles) -> dict[str, Path]:
-    """Return the folders through which stages exchange results, by the names of the notebooks' parameters."""
-    return {
-        "map_feats_root": files.embeddings,
-        "out_jsonl": files.retrieval_dir,
-        "retrieval_dir": files.retrieval_dir,
-        "features_dir": files.features,
-        "map_dir": files.maps,
-        "poses_dir": files.poses_dir,
-        "evaluation_dir": files.evaluation,
-    }
-
-
-def stage_outputs(files: SceneFiles, stage: str) -> Path | None:
-    """Return the folder of a stage's results; None if the stage writes only its executed notebook."""
-    return {
-        "embed": files.embeddings,
-        "retrieve": files.retrieval_dir,
-        "rerank": files.reranked_dir,
-        "localize": files.poses_dir,
-        "sequence": files.poses_dir,
-        "evaluate": files.evaluation,
-        "visualize": files.visualization,
-    }.get(stage)
-
-
 _TAKEN = ".taken.json"
 _RESULTS, _CACHES = ("embeddings", "retrieval", "reranked", "poses"), ("features", "map", "index")
 """Folders that notebooks by hand take from a run. Caches are taken once: stages find in them what still fits."""
@@ -301,7 +274,7 @@ def _take_from_run(stage: str, files: SceneFiles) -> None:
     They lead to results of a finished run of the scene: the run called `<scene>`, or else the latest one. If that run
     changes, its new results are taken.
     """
-    taken, made_here = read_json(files.root / _TAKEN), stage_outputs(files, stage)
+    taken, made_here = read_json(files.root / _TAKEN), files.of_stage(stage)
     if made_here is not None:
         taken.pop(made_here.name, None)  # the links stay until the stage replaces them; from now on they are its own
     run = _finished_run(files.run.parent, files.scene)
@@ -335,10 +308,10 @@ def _finished_run(runs: Path, scene: str) -> Path | None:
 def _make_upstream(stage: str, sessions: Path, files: SceneFiles, folders: set[Path | None]) -> None:
     """Run the earlier stages whose results `stage` needs and whose folder is in `folders` and empty or absent."""
     for name in UPSTREAM[stage]:
-        folder = stage_outputs(files, name)
+        folder = files.of_stage(name)
         if folder is None or name in OPTIONAL or folder not in folders:
             continue
-        _make_upstream(name, sessions, files, {stage_outputs(files, earlier) for earlier in UPSTREAM[name]})
+        _make_upstream(name, sessions, files, {files.of_stage(earlier) for earlier in UPSTREAM[name]})
         if not (folder.is_dir() and any(folder.iterdir())):
             print(f"{name}: no results yet, running it now into {folder}")
         elif older := older_files(folder, name):
@@ -376,12 +349,11 @@ def _user_names() -> dict[str, Any]:
     return shell.user_ns if shell else {}
 
 
-def check_given(name: str, **choices: Iterable[str]) -> None:
+def check_given(name: str) -> None:
     """Refuse wrong parameter values in the running notebook, and unknown parameters that papermill has injected.
 
     Args:
         name: name of the notebook, `<number>_<name>.ipynb`.
-        **choices: the valid words of a parameter, by its name.
 
     Raises:
         ManifestError: names the parameter, what was found and what was expected.
@@ -391,9 +363,6 @@ def check_given(name: str, **choices: Iterable[str]) -> None:
         if source.startswith("# Parameters\n"):
             check_parameters(notebook_path(name), _literals(source))
     check_values(name, values)
-    for key, known in choices.items():
-        if key in values and values[key] not in known:
-            raise ManifestError(f"{key}: found {values[key]!r}. {nearest(values[key], known)}")
 
 
 def _check_devices_and_queries(stage: str, sessions: Path) -> None:
@@ -401,22 +370,15 @@ def _check_devices_and_queries(stage: str, sessions: Path) -> None:
     from toolkit.capture import Capture
 
     values, known = _user_names(), notebook_parameters(notebook_path(stage))
-    if "queries" in values and "queries" in known:
-        capture = Capture.from_sessions_root(sessions)
-        lists = {name for session in capture.usable("query") for name in session.keyframe_files}
-        short = str(values["queries"]).removesuffix(".txt").removeprefix("keyframes_")
-        if lists and short not in lists | {"all"}:
-            names = ["all", *(name if name == "queries" else f"keyframes_{name}" for name in lists)]
-            found = f"queries: found {values['queries']!r}, which no query session in {capture.path} has."
-            raise CaptureError(f"{found} {nearest(str(values['queries']), names)}")
+    asked = {name: values[name] for name in known if name in values}
+    capture = Capture.from_sessions_root(sessions) if asked else None
     for name, split in (("map_device", "map"), ("query_device", "query")):
-        if name not in values or name not in known:
-            continue
-        capture = Capture.from_sessions_root(sessions)
-        present = [device for device in capture.devices if f"{device}_{split}" in capture]
-        if values[name] not in (*present, "all", "auto"):
-            found = f"{name}: found {values[name]!r}, which has no {split} session in {capture.path}."
-            raise CaptureError(f"{found} {nearest(values[name], [*present, 'all'])}")
+        if capture and name in asked:
+            capture.devices_with(split, asked[name])
+    if capture and "queries" in asked and asked["queries"] != "all" and (recorded := capture.usable("query")):
+        short = str(asked["queries"]).removesuffix(".txt").removeprefix("keyframes_")
+        if not any(short in session.keyframe_files for session in recorded):
+            recorded[0].keyframes(asked["queries"])  # raises the error
 
 
 def stage_settings(stage: str, values: Mapping[str, Any]) -> Settings:
@@ -463,32 +425,29 @@ def check_values(name: str, values: Mapping[str, Any]) -> None:
     """
     path = notebook_path(name)
     checked = {"settings", *type(stage_settings(name, values)).model_fields} if name in STAGES else set()
-    for key, default in notebook_parameters(path).items():
-        if key in checked or key not in values:
-            continue
-        value = values[key]
-        if key == "pairs":
-            pairs = value if isinstance(value, list | tuple) else [value]
-            fits = value is None or all(isinstance(pair, list | tuple) and len(pair) == 2 for pair in pairs)
-            expected = 'None or a list such as [["ios", "hl"]]'
-        elif key == "runs":
-            listed = isinstance(value, list | tuple) and all(isinstance(run, str | Path) for run in value)
-            fits = value is None or listed
-            expected = 'None or a list of run folders such as ["../runs/a", "../runs/b"]'
-        elif key == "inspect":
-            fits, expected = isinstance(value, int | str), "the number of a query, or the name of one of its images"
-        elif default is None:
-            fits, expected = value is None or isinstance(value, str | Path), "None or the path of a folder as text"
-        elif type(default) is int:
-            fits, expected = type(value) is int and value >= 0, f"a whole number, 0 or more, such as {default}"
-        elif type(default) is float:
-            optional = key == "unit_m"  # None: unknown
-            fits = type(value) in (int, float) or (optional and value is None)
-            expected = f"{'None or ' if optional else ''}a number such as {default}"
-        else:
-            fits, expected = isinstance(value, type(default)), f"a {type(default).__name__} such as {default!r}"
-        if not fits:
-            raise ManifestError(f"{key}: found {value!r}, expected {expected}. It is a parameter of {path.name}.")
+    defaults = {key: value for key, value in notebook_parameters(path).items() if key not in checked and key in values}
+    fields: dict[str, Any] = {key: (_TYPES.get(key, _type_of(value)), ...) for key, value in defaults.items()}
+    model = create_model(path.stem, __config__=ConfigDict(strict=True), **fields)
+    try:
+        model.model_validate({key: values[key] for key in fields})
+    except ValidationError as error:
+        raise ManifestError(explain(error, model, path.name)) from None
+
+
+Pair = Annotated[Sequence[str], Field(min_length=2, max_length=2)]
+_TYPES: dict[str, Any] = {
+    "device": str | list[str],
+    "inspect": int | str,
+    "pairs": Sequence[Pair] | None,
+    "runs": Sequence[str | Path] | None,
+    "unit_m": float | None,
+}
+"""Types of parameters that are not those of their defaults."""
+
+
+def _type_of(default: Any) -> Any:
+    """Return the type of a parameter, by its default: a folder if that is None; numbers are not negative."""
+    return str | Path | None if default is None else NonNegativeInt if type(default) is int else type(default)
 
 
 def _literals(source: str) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import pandas as pd
 from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles, of_sequence, pair_devices, read_json
-from toolkit.runs.record import RECORD
+from toolkit.runs.folder import RECORD
 from toolkit.scene.map import Map, localized_scenes, no_such_run
 
 
