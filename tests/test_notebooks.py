@@ -82,7 +82,7 @@ def test_parameters_are_of_the_run_or_settings_with_their_defaults(stage: str) -
 def test_a_stage_gets_the_parameters_of_its_notebook_and_then_its_dict(monkeypatch: pytest.MonkeyPatch) -> None:
     names = {"topk": 3, "index": "a variable of the user", "settings": {"mask": {"gps": True}}}
     monkeypatch.setattr(notebook, "_user_names", lambda: names)
-    folders = notebook.Folders({}, "retrieve")
+    folders = notebook.Folders("retrieve")
     assert folders.settings == RetrieveSettings.of({"topk": 3, "mask": {"gps": True}})
     names["settings"] = {"topk": 4}  # the cell has run again, with another value
     assert folders.settings.topk == 4

@@ -218,15 +218,11 @@ def read_sidecar(path: str | Path) -> dict[str, Any] | None:
     """
     record = _read_record(path)
     settings = record.get("settings")
-    if record.get("version") != __version__ or record.get("unfinished") or not isinstance(settings, dict):
+    if record.get("version") != __version__ or record.get("unfinished") or not record.get("files"):
         return None
-    if not record.get("files"):  # written by a version without checksums
-        return None
-    damage = _damage(path, record)
-    whole = record.get("fingerprint") == fingerprint(settings)
-    if not damage and not (whole and record.get("sources", "") in ("", fingerprint(record.get("made_from")))):
-        damage = f"{sidecar_path(path)} is damaged"
-    if damage:
+    whole = isinstance(settings, dict) and record.get("fingerprint") == fingerprint(settings)
+    whole = whole and record.get("sources", "") in ("", fingerprint(record.get("made_from")))
+    if damage := _damage(path, record) or ("" if whole else f"{sidecar_path(path)} is damaged"):
         log.warning("%s: not reused.", damage)
     return None if damage else settings
 
@@ -248,10 +244,9 @@ def require_whole(path: str | Path, of: str | Path | None = None) -> None:
     """
     artifact = Path(of or path)
     if damage := _damage(artifact, _read_record(artifact), Path(path).name):
-        raise ArtifactError(
-            f"{damage}. Run the stage that makes it again. If it was changed on purpose, delete "
-            f"{sidecar_path(artifact)}: it is then used as it is."
-        )
+        record = sidecar_path(artifact)
+        text = f"Run the stage that makes it again. To use a file that was changed on purpose, delete {record}"
+        raise ArtifactError(f"{damage}. {text}.")
 
 
 def changed_sources(artifact: str | Path) -> list[Path]:
@@ -508,18 +503,16 @@ def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:
         ArtifactError: the file is missing or damaged, or a line is not such a row.
     """
     rows: list[dict[str, Any]] = []
-    keys, number = {"timestamp", "sensor_id", "topk", *needed}, 0
+    number = 0
     try:
         with open(path, encoding="utf-8") as lines:
             for line in lines:
                 number += 1
                 if line.strip():
-                    rows.append(_checked(json.loads(line), keys))
+                    rows.append(_checked(json.loads(line), {"timestamp", "sensor_id", "topk", *needed}))
     except FileNotFoundError:
-        raise ArtifactError(
-            f"No references: {path} is missing. Run the retrieve stage first "
-            "(python -m toolkit run MANIFEST --only retrieve)."
-        ) from None
+        do = "Run the retrieve stage first (python -m toolkit run MANIFEST --only retrieve)."
+        raise ArtifactError.at(path, "no such file of references", do=do) from None
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise ArtifactError(f"{path}, line {number}: not a retrieval row ({error}). Retrieve again.") from None
     require_whole(path)
@@ -528,10 +521,9 @@ def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:
 
 def _checked(row: Any, keys: set[str]) -> dict[str, Any]:
     if not isinstance(row, dict) or not keys <= row.keys():
-        found = sorted(row) if isinstance(row, dict) else row
-        raise ValueError(f"found {found!r}; expected the keys {', '.join(sorted(keys))} and others")
+        raise ValueError(f"found {str(row)[:80]}; expected the keys {', '.join(sorted(keys))} and others")
     if not isinstance(row["topk"], list):
-        raise TypeError(f"found topk {row['topk']!r}; expected a list of references")
+        raise TypeError("expected a list of references as topk")
     if not all(isinstance(reference, dict) and "path" in reference for reference in row["topk"]):
         raise ValueError("a reference in topk has no path")
     int(row["timestamp"])
@@ -583,9 +575,7 @@ def require_same(expected: Mapping[str, Any], here: Mapping[str, Any]) -> None:
         ToolkitError: names the settings that differ.
     """
     differing = [name for name in {**expected, **here} if expected.get(name) != here.get(name)]
-    if differing:
-        found = "; ".join(f"{name}: {here.get(name)} here, {expected.get(name)} there" for name in differing)
-        raise ToolkitError(
-            f"The worker on {platform.node()} has other settings than the main process ({found}). "
-            "Set them in the manifest, or use machines of one kind."
-        )
+    found = "; ".join(f"{name}: {here.get(name)} here, {expected.get(name)} there" for name in differing)
+    if found:
+        do = "Set them in the manifest, or use machines of one kind."
+        raise ToolkitError.at(f"worker on {platform.node()}", found, "the settings of the main process", do)

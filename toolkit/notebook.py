@@ -12,7 +12,9 @@ import re
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tqdm.auto
@@ -21,7 +23,7 @@ from pydantic import ConfigDict, Field, NonNegativeInt, ValidationError, create_
 
 from toolkit import errors
 from toolkit.errors import ManifestError, StageError, shortage
-from toolkit.files import SceneFiles, files_fingerprint, link_folder, older_files, read_json, write_text
+from toolkit.files import SceneFiles, link_folder, older_files, read_json, write_text
 from toolkit.manifest import (
     OPTIONAL,
     STAGES,
@@ -75,27 +77,21 @@ if TEXT_BARS in os.environ:
     tqdm.auto.tqdm = tqdm.std.tqdm
 
 
-class Folders:
+class Folders(SimpleNamespace):
     """The resolved folders of a notebook, as attributes; displayed as a table. `settings` are those of its stage."""
 
-    def __init__(self, folders: dict[str, Path], stage: str) -> None:
-        self._folders, self._stage = folders, stage
+    def __init__(self, stage: str, **folders: Path) -> None:
+        super().__init__(**folders)
+        self._stage = stage
 
     @property
     def settings(self) -> Any:
         """The settings model of the stage, from the notebook's parameters as they are now."""
         return stage_settings(self._stage, _user_names())
 
-    def __getattr__(self, name: str) -> Path:
-        folders = self.__dict__.get("_folders", {})
-        if name not in folders:
-            raise AttributeError(f"{name}: not a folder of this notebook. {nearest(name, folders)}")
-        path: Path = folders[name]
-        return path
-
     def __repr__(self) -> str:
-        width = max(len(name) for name in self._folders)
-        return "\n".join(f"{name:<{width}}  {path}" for name, path in self._folders.items())
+        folders = {name: path for name, path in vars(self).items() if name != "_stage"}
+        return "\n".join(f"{name:<{max(map(len, folders))}}  {path}" for name, path in folders.items())
 
 
 def start(stage: str, sessions_root: str | None = None, **folders: str | None) -> Folders:
@@ -130,18 +126,16 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
     for name, folder in folders.items():
         resolved[name] = Path(folder).expanduser().resolve() if folder else defaults[name]
         if folder and run_log is None and defaults[name] == files.of_stage(stage):
-            _require_outside_of_runs(name, resolved[name], sessions)
-    return Folders(resolved, stage)
+            _require_outside_of_runs(name, resolved[name])
+    return Folders(stage, **resolved)
 
 
-def _require_outside_of_runs(name: str, folder: Path, sessions: Path) -> None:
+def _require_outside_of_runs(name: str, folder: Path) -> None:
     """Refuse a folder of results, the value of the parameter `name`, that belongs to a finished run."""
     run = next((parent for parent in folder.parents if (parent / RECORD).is_file()), None)
     if run is not None:
-        raise ManifestError(
-            f"{name}: {folder} belongs to the run {run}, which changes only by its manifest. Leave {name} out: results "
-            f"then go to {_root() / 'runs' / f'{sessions.parent.name}-by-hand'}. Or give another folder."
-        )
+        found = f"a folder of the run {run}, which changes only by its manifest"
+        raise ManifestError.at(name, found, do="Leave it out, or give another folder.")
 
 
 def sessions_or_demo(sessions_root: str | None) -> Path:
@@ -228,10 +222,8 @@ def notebook_path(stage: str) -> Path:
     """Return the notebook of a stage, `<number>_<stage>.ipynb`."""
     path = next(iter(sorted(NOTEBOOKS.glob(f"[0-9]*_{stage}.ipynb"))), None)
     if path is None:
-        raise ManifestError(
-            f"{NOTEBOOKS}: no notebook for the stage {stage}. The pipeline needs a clone of the repository: "
-            "install the toolkit there with `pip install --editable .`."
-        )
+        do = "Install the toolkit in a clone of its repository: `pip install --editable .`."
+        raise ManifestError.at(NOTEBOOKS, f"no notebook for the stage {stage}", do=do)
     return path
 
 
@@ -251,8 +243,8 @@ def notebook_parameters(path: Path) -> dict[str, Any]:
     raise ManifestError(f"{path}: no cell is tagged `parameters`.")
 
 
-def check_parameters(path: Path, parameters: Iterable[str], where: str = "") -> None:
-    """Refuse parameters that the notebook `path` does not have; papermill would only warn. Messages begin with `where`.
+def check_parameters(path: Path, parameters: Iterable[str]) -> None:
+    """Refuse parameters that the notebook `path` does not have; papermill would only warn.
 
     Raises:
         ManifestError: a parameter is unknown; the message names the nearest known one.
@@ -260,7 +252,7 @@ def check_parameters(path: Path, parameters: Iterable[str], where: str = "") -> 
     known = notebook_parameters(path)
     for name in parameters:
         if name not in known:
-            raise ManifestError(f"{where}{name}: {path.name} has no such parameter. {nearest(name, known)}")
+            raise ManifestError(f"{name}: {path.name} has no such parameter. {nearest(name, known)}")
 
 
 _TAKEN = ".taken.json"
@@ -278,24 +270,18 @@ def _take_from_run(stage: str, files: SceneFiles) -> None:
     if made_here is not None:
         taken.pop(made_here.name, None)  # the links stay until the stage replaces them; from now on they are its own
     run = _finished_run(files.run.parent, files.scene)
-    donor = None if run is None else SceneFiles(run, files.scene).root
-    links = {} if donor is None else {name: (donor / name, files.root / name) for name in (*_RESULTS, *_CACHES)}
-    for name, (source, target) in links.items():
-        if not source.is_dir() or target == made_here or (target.exists() and name not in taken):
+    for name in (*_RESULTS, *_CACHES):
+        target = files.root / name
+        if run is None or target == made_here or (target.exists() and name not in taken):
             continue
-        state = f"{run} {_state(source)}"
-        if taken.get(name) != state:
+        source, state = run / files.scene / name, f"{run}, {read_json(run / RECORD).get('created')}"
+        if source.is_dir() and taken.get(name) != state:
             shutil.rmtree(target, ignore_errors=True)
             link_folder(source, target)
             taken |= {name: state} if name in _RESULTS else {}
             print(f"{name}: taken from {run}")
     if taken or (files.root / _TAKEN).exists():
         write_text(files.root / _TAKEN, json.dumps(taken) + "\n")
-
-
-def _state(folder: Path) -> str:
-    """Return a fingerprint of a folder's files."""
-    return files_fingerprint(sorted(path for path in folder.rglob("*") if path.is_file()))
 
 
 def _finished_run(runs: Path, scene: str) -> Path | None:
@@ -326,20 +312,15 @@ def _run_stage(stage: str, sessions: Path, files: SceneFiles) -> None:
     run = _finished_run(files.run.parent, files.scene)
     content = read_json(run / RECORD).get("manifest", {}) if run else {}
     manifest = Manifest.of(content or {"name": "by-hand", "captures": [str(sessions.parent)]})
-    settings, queries = manifest.stage(stage).given(), manifest.queries
-    if stage == "embed":
-        from toolkit.embed import embed_sessions
-
-        embed_sessions(sessions, files.embeddings, settings)
-    elif stage == "retrieve":
-        from toolkit.retrieve import retrieve_pairs
-
-        retrieve_pairs(sessions, files.embeddings, files.retrieval_dir, settings, queries=queries)
-    else:
-        from toolkit.localize import localize_pairs
-
-        folders = (files.retrieval_dir, files.poses_dir, files.features, files.maps)
-        localize_pairs(sessions, *folders, settings, queries=queries)
+    folders = {
+        "embed": [files.embeddings],
+        "retrieve": [files.embeddings, files.retrieval_dir],
+        "localize": [files.retrieval_dir, files.poses_dir, files.features, files.maps],
+    }
+    name = "embed_sessions" if stage == "embed" else f"{stage}_pairs"
+    options = {} if stage == "embed" else {"queries": manifest.queries}
+    run_stage = getattr(import_module(f"toolkit.{stage}"), name)
+    run_stage(sessions, *folders[stage], manifest.stage(stage), **options)
 
 
 def _user_names() -> dict[str, Any]:
