@@ -49,24 +49,23 @@ Scene = Annotated[str, Argument(help="Name of the capture.")]
 MapDevice = Annotated[str, Argument(help="Map device.")]
 QueryDevice = Annotated[str, Argument(help="Query device.")]
 TextFile = Annotated[Path, Argument(help="Text file.")]
-Axes = Annotated[
-    str,
-    Option(
-        "--axes",
-        metavar="opencv|opengl",
-        help="Camera axes of the poses. opencv: x right, y down, z forward; opengl: x right, y up, z backward.",
-    ),
-]
-Names = Annotated[
-    str,
-    Option(
-        "--names",
-        metavar="own|capture",
-        help="Name imported images as in your folder (own), or as in the capture (capture).",
-    ),
+_AXES = "Camera axes of the poses. opencv: x right, y down, z forward; opengl: x right, y up, z backward."
+Axes = Annotated[str, Option("--axes", metavar="opencv|opengl", help=_AXES)]
+_NAMES = "Name imported images as in your folder (own), or as in the capture (capture)."
+Names = Annotated[str, Option("--names", metavar="own|capture", help=_NAMES)]
+Settings = Annotated[
+    list[str] | None, Option("--set", metavar="KEY=VALUE", help="Replace a setting; `run`: in a new run.")
 ]
 Capture = Annotated[Path | None, Option(help="Capture folder, if it has moved since the run.")]
 Json = Annotated[bool, Option("--json", help="Print only a summary as JSON to stdout, everything else to stderr.")]
+_CLUSTER = "Dask workers: N on this machine, of a scheduler, or started by a cluster's queue (see docs/scaling.md)."
+_SWEEP = "Run once per value, each in its own folder, and compare. Repeat it to run all combinations."
+_FAILED = (
+    "What to write for a query without a pose. `nearest`, the default: the pose of its best retrieved reference, as "
+    "recall counts a missing pose as a miss, so a rough pose cannot reduce it, and the submission is complete. The "
+    "description gives the number of such queries, and submission.csv lists them. `leave-out`: nothing."
+)
+_TABLE = "CSV with a header: image; qw,qx,qy,qz,tx,ty,tz for poses; camera_id, or model,width,height,params."
 
 
 @app.command()
@@ -74,34 +73,11 @@ def run(
     manifest: Annotated[Path, Argument(help="Manifest, for example data_manifests/demo.yaml.")],
     only: Annotated[str | None, Option(metavar="STAGE", help="Run only this stage.")] = None,
     force: Annotated[bool, Option("--force", help="Also run stages that are up to date.")] = False,
-    overrides: Annotated[
-        list[str] | None,
-        Option(
-            "--set", metavar="KEY=VALUE", help="Replace a setting, e.g. localize.method=nearest; in a run of its own."
-        ),
-    ] = None,
-    name: Annotated[
-        str | None, Option(help="Name of the run folder; default: the manifest's, with what --set changes.")
-    ] = None,
-    in_place: Annotated[
-        bool, Option("--in-place", help="With --set: replace the results of the manifest's own run.")
-    ] = False,
-    cluster: Annotated[
-        str | None,
-        Option(
-            metavar="local[:N]|tcp://HOST:PORT|slurm:FILE",
-            help="Run on Dask workers: N on this machine, those of a scheduler, or workers started by a cluster's "
-            "queue (see docs/scaling.md).",
-        ),
-    ] = None,
-    sweeps: Annotated[
-        list[str] | None,
-        Option(
-            "--sweep",
-            metavar="KEY=A,B,C",
-            help="Run once per value, each in its own folder, and compare. Repeat it to run all combinations.",
-        ),
-    ] = None,
+    overrides: Settings = None,
+    name: Annotated[str | None, Option(help="Name of the run folder; default: says what --set changes.")] = None,
+    in_place: Annotated[bool, Option("--in-place", help="With --set: replace the manifest's own results.")] = False,
+    cluster: Annotated[str | None, Option(metavar="local[:N]|tcp://HOST:PORT|slurm:FILE", help=_CLUSTER)] = None,
+    sweeps: Annotated[list[str] | None, Option("--sweep", metavar="KEY=A,B,C", help=_SWEEP)] = None,
     as_json: Json = False,
 ) -> None:
     """Run the notebooks of a manifest, skip what is up to date, and write a report.
@@ -117,8 +93,9 @@ def run(
         if sweeps and (name or in_place):
             raise ManifestError("--sweep names its runs itself: leave out --name and --in-place.")
         if sweeps:
-            options = {"only": only, "force": force, "cluster": cluster}
-            _sweep(manifest, sweeps, overrides or (), tell, as_json, **options)
+            _compare_swept(
+                *pipeline.sweep(manifest, sweeps, overrides or (), tell, only, force, cluster), tell, as_json
+            )
             return
         run_dir = pipeline.run(manifest, only, force, overrides or (), tell, cluster, name, in_place)
     except BaseException as error:
@@ -138,9 +115,7 @@ def run(
 @app.command()
 def compare(
     runs: Annotated[list[Path], Argument(help="Two or more run folders, compared with the first.")],
-    out: Annotated[
-        Path | None, Option(help="HTML file, the notebook beside it; else compare_<names>.html by the first run.")
-    ] = None,
+    out: Annotated[Path | None, Option(help="HTML file; default: compare_<names>.html by the first run.")] = None,
     pictures: Annotated[int, Option(min=0, help="Number of queries won or lost to draw, per run.")] = 4,
     seed: Annotated[int, Option(min=0, help="Seed of the resampling for the intervals.")] = 0,
     as_json: Json = False,
@@ -191,9 +166,7 @@ def check(
 @app.command()
 def new(
     name: Annotated[str, Argument(help="Name of the manifest and its run, runs/<name>: letters, digits, -, _.")],
-    capture: Annotated[
-        Path | None, Argument(help="Capture folder, with sessions/ in it; default: a placeholder to fill in.")
-    ] = None,
+    capture: Annotated[Path | None, Argument(help="Capture folder; default: a placeholder to fill in.")] = None,
     out: Annotated[Path, Option(help="Folder of the manifest.")] = Path("data_manifests"),
 ) -> None:
     """Write a manifest for a capture, with explanations and the findings of `check`."""
@@ -206,20 +179,9 @@ def new(
 @app.command()
 def submit(
     runs: Annotated[list[Path], Argument(help="Run folders; scenes may be distributed over several.")],
-    description: Annotated[
-        str, Option(metavar="TEXT|FILE", help="Description: method, thresholds, link to the code.")
-    ] = "",
+    description: Annotated[str, Option(metavar="TEXT|FILE", help="Method, thresholds, link to the code.")] = "",
     out: Annotated[Path | None, Option(help="Zip file; default: RUN/submission.zip.")] = None,
-    failed: Annotated[
-        str,
-        Option(
-            metavar="nearest|leave-out",
-            help="What to write for a query without a pose. `nearest`: the pose of its best retrieved reference. This "
-            "is the default: recall counts a missing pose as a miss, so a rough pose cannot reduce it, and the "
-            "submission is complete. The description gives the number of such queries, and submission.csv lists them. "
-            "`leave-out`: nothing; the zip then has only localized queries.",
-        ),
-    ] = "nearest",
+    failed: Annotated[str, Option(metavar="nearest|leave-out", help=_FAILED)] = "nearest",
     queries: Annotated[str | None, Option(help="List of the query keyframes; default: the challenge's.")] = None,
     scene: Annotated[list[str] | None, Option(help="Only this scene; repeat for more.")] = None,
     capture: Annotated[list[Path] | None, Option(help="Capture folder, if it has moved since the run.")] = None,
@@ -240,14 +202,10 @@ def submit(
 @app.command()
 def download(
     manifest: Annotated[Path, Argument(help="Manifest with `dataset`, as data_manifests/crocodl-hydro.yaml.")],
-    sessions: Annotated[
-        str, Option(metavar="NAME,...", help="Only these sessions of the manifest, e.g. ios_map,hl_query.")
-    ] = "",
+    sessions: Annotated[str, Option(metavar="NAME,...", help="Only these, e.g. ios_map,hl_query.")] = "",
     dry_run: Annotated[bool, Option("--dry-run", help="List files and sizes; fetch nothing.")] = False,
     keep_archives: Annotated[bool, Option("--keep-archives", help="Keep archives after unpacking.")] = False,
-    overrides: Annotated[
-        list[str] | None, Option("--set", metavar="KEY=VALUE", help="Replace a setting, as for `run`.")
-    ] = None,
+    overrides: Settings = None,
 ) -> None:
     """Download, unpack and check the captures of a manifest; resume a stopped download."""
     from toolkit.exchange.download import download
@@ -300,20 +258,13 @@ def import_images(
     capture: Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
     device: Device = "ios",
     split: Annotated[str, Option(metavar="map|query", help="A map needs a table with poses.")] = "query",
-    table: Annotated[
-        Path | None,
-        Option(
-            help="CSV with a header: image; qw,qx,qy,qz,tx,ty,tz for poses; camera_id, or model,width,height,params."
-        ),
-    ] = None,
+    table: Annotated[Path | None, Option(help=_TABLE)] = None,
     poses_are: Annotated[
         str, Option(metavar="world_from_cam|cam_from_world", help="Direction of the table's poses.")
     ] = "world_from_cam",
     axes: Axes = "opencv",
     unit: Annotated[float, Option(metavar="METERS", help="Meters per unit of the poses, e.g. 0.01.")] = 1.0,
-    truth: Annotated[
-        Path | None, Option(help="CSV like the table, with ground-truth poses of the queries, for evaluation.")
-    ] = None,
+    truth: Annotated[Path | None, Option(help="CSV like the table, with ground-truth poses of queries.")] = None,
     camera: Annotated[
         str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all images; else guessed from EXIF.")
     ] = None,
@@ -335,9 +286,7 @@ def import_transforms(
     capture: Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
     device: Device = "ios",
     split: Annotated[str, Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
-    hold_out: Annotated[
-        int, Option(metavar="N", help="Every Nth image becomes a query with ground truth; 0: none.")
-    ] = 0,
+    hold_out: Annotated[int, Option(metavar="N", help="Every Nth image becomes a query with truth; 0: none.")] = 0,
     unit: Annotated[float | None, Option(metavar="METERS", help="Meters per unit of the poses if known.")] = None,
     axes: Axes = "opengl",
     placing: Placing = "link",
@@ -380,36 +329,31 @@ def export_pairs(
     print(f"{out}: {export.export_pairs(run, scene, map_device, query_device, out, topk, names)} pairs")
 
 
-@export_app.command("poses")
-def export_poses(
-    run: Run,
-    scene: Scene,
-    map_device: MapDevice,
-    query_device: QueryDevice,
-    out: TextFile,
-    capture: Capture = None,
-    names: Names = "own",
-) -> None:
-    """Write the poses of a pair's queries in hloc's format: `name qw qx qy qz tx ty tz` per line, cam_from_world."""
-    from toolkit.exchange import export
+def _export_of_pair(what: str, unit: str) -> Callable[..., None]:
+    def export(
+        run: Run,
+        scene: Scene,
+        map_device: MapDevice,
+        query_device: QueryDevice,
+        out: TextFile,
+        capture: Capture = None,
+        names: Names = "own",
+    ) -> None:
+        from toolkit.exchange import export
 
-    print(f"{out}: {export.export_poses(run, scene, map_device, query_device, out, capture, names)} poses")
+        function = getattr(export, f"export_{what}")
+        print(f"{out}: {function(run, scene, map_device, query_device, out, capture, names)} {unit}")
+
+    return export
 
 
-@export_app.command("intrinsics")
-def export_intrinsics(
-    run: Run,
-    scene: Scene,
-    map_device: MapDevice,
-    query_device: QueryDevice,
-    out: TextFile,
-    capture: Capture = None,
-    names: Names = "own",
-) -> None:
-    """Write the cameras of a pair's queries in hloc's format: `name MODEL width height parameters` per line."""
-    from toolkit.exchange import export
-
-    print(f"{out}: {export.export_intrinsics(run, scene, map_device, query_device, out, capture, names)} images")
+for _what, _unit, _help in (
+    ("poses", "poses", "Write the poses of a pair's queries in hloc's format: `name qw qx qy qz tx ty tz` per line, "
+     "cam_from_world."),
+    ("intrinsics", "images", "Write the cameras of a pair's queries in hloc's format: `name MODEL width height "
+     "parameters` per line."),
+):  # fmt: skip
+    export_app.command(_what, help=_help)(_export_of_pair(_what, _unit))
 
 
 @export_app.command("features")
@@ -470,20 +414,15 @@ def record(
     print(f"Open it: {rrd.command}")
 
 
-def _sweep(
-    manifest: Path, sweeps: Sequence[str], overrides: Sequence[str], tell: Callable[..., None], as_json: bool,
-    **options: Any,
-) -> None:  # fmt: skip
-    """Run a manifest with each combination of values, and compare the finished runs."""
-    from toolkit import pipeline
+def _compare_swept(folders: list[Path], errors: list[ToolkitError], tell: Callable[..., None], as_json: bool) -> None:
+    """Compare the finished runs of a sweep, and raise the first error."""
     from toolkit.runs.folder import summary
 
-    folders, errors = pipeline.sweep(manifest, sweeps, overrides, tell, **options)
     for result in map(summary, folders):
         if result["exit_code"] != 0:
             errors.append(IncompleteError(f"{result['name']}: {result['error']}"))
-    as_json = as_json and not errors  # if there is an error, stdout has its JSON instead
     if len(folders) > 1:
+        as_json = as_json and not errors  # if there is an error, stdout has its JSON instead
         try:
             _compare(folders, tell, as_json)
         except ArtifactError as error:  # not evaluated (`--only`), or without ground truth
@@ -495,10 +434,8 @@ def _sweep(
         raise errors[0]
 
 
-def _compare(
-    runs: list[Path], tell: Callable[..., None], as_json: bool, out: Path | None = None, pictures: int = 4,
-    seed: int = 0,
-) -> None:  # fmt: skip
+def _compare(runs: list[Path], tell: Callable[..., None], as_json: bool, out: Path | None = None, pictures: int = 4,
+             seed: int = 0) -> None:  # fmt: skip
     """Compare runs and print the result; execute the notebook on them, and write it as a page."""
     from toolkit.notebook import execute, notebook_path, write_page
     from toolkit.show.comparison import compare_runs
