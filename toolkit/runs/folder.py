@@ -10,8 +10,7 @@ import shutil
 import socket
 import tempfile
 import time
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -52,10 +51,8 @@ def held(run_dir: Path) -> Iterator[None]:
     except Timeout:
         other = read_json(holder)
         who = f"process {other.get('pid', '?')} on {other.get('host', '?')}, since {other.get('since', '?')}"
-        raise ToolkitError(
-            f"{run_dir}: another run is using this folder: {who}. Wait until it ends, stop it, or write this run to "
-            "another folder (--set output_root=FOLDER)."
-        ) from None
+        do = "Wait until it ends, stop it, or write this run to another folder (--set output_root=FOLDER)."
+        raise ToolkitError(f"{run_dir}: another run is using this folder: {who}. {do}") from None
     try:
         me = {"pid": os.getpid(), "host": socket.gethostname()}
         with log_to(run_dir / LOG), environment_variable(LOG_VARIABLE, str((run_dir / LOG).absolute())):
@@ -117,12 +114,7 @@ def warnings_of_kernels(path: Path, start: int) -> list[str]:
 
     Warnings of this process are already on the terminal.
     """
-    try:
-        with path.open("rb") as file:
-            file.seek(start)
-            lines = file.read().decode("utf-8", errors="replace").splitlines()
-    except OSError:
-        return []
+    lines = path.read_bytes()[start:].decode("utf-8", errors="replace").splitlines()
     matches = (re.fullmatch(r"\S+ \S+ (\d+) WARNING toolkit\.\S+: (.+)", line) for line in lines)
     return list(dict.fromkeys(match[2] for match in matches if match and int(match[1]) != os.getpid()))
 
@@ -186,6 +178,7 @@ class RunLog:
     def write(self) -> None:
         """Write the current state to `run.json`."""
         rows = self.all_rows()
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         work = sum(row.get("work_seconds", 0.0) for row in rows if row["status"] == "done")
         content = {
             "name": self.manifest.name,
@@ -197,7 +190,7 @@ class RunLog:
             "pid": os.getpid(),
             "manifest": self.manifest.model_dump(mode="json", exclude_none=True),
             "versions": _versions(),
-            "machine": _machine(),
+            "machine": {"cores": cores, "python": platform.python_version(), "platform": platform.platform()},
             "code": self.code,
             "scenes": list(self.inputs),
             "inputs": self.inputs,
@@ -215,27 +208,21 @@ class RunLog:
         return sorted(rows, key=lambda row: (scenes.index(row["scene"]), STAGES.index(row["stage"])))
 
 
-def failures(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
+def failures(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
     """Return how many images, queries and pairs failed, `{kind: {"failed": n, "of": total}}`, from rows of stages."""
     totals = {kind: {"failed": 0, "of": 0} for kind in ("images", "queries", "pairs")}
-    lost: dict[tuple[str, str], set[str]] = {}
-    asked = Counter[tuple[str, str]]()
     for row in rows:
         counts = row.get("counts") or {}
         for kind, stage, name in (("images", "embed", "unreadable"), ("queries", "localize", "failed")):
             if row["stage"] == stage and {kind, name} <= counts.keys():
                 totals[kind]["failed"] += counts[name]
                 totals[kind]["of"] += counts[kind]
-        if "asked" in row:
-            of_stage = row["scene"], row["stage"]
-            asked[of_stage] += row["asked"]
-            lost.setdefault(of_stage, set()).update(one["what"] for one in row.get("left_out", ()))
-    for scene in dict.fromkeys(scene for scene, _ in asked):
-        of_scene = [(of, stage) for of, stage in asked if of == scene]
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        asked = [row for row in rows if row["scene"] == scene and "asked" in row]
         # The rows of embed are recordings, not pairs. A failed pair fails in all later stages: count it once.
-        of_pairs = [(of, stage) for of, stage in of_scene if stage != "embed"] or of_scene
-        totals["pairs"]["failed"] += len(set[str]().union(*(lost[of_stage] for of_stage in of_pairs)))
-        totals["pairs"]["of"] += max(asked[of_stage] for of_stage in of_pairs)
+        asked = [row for row in asked if row["stage"] != "embed"] or asked
+        totals["pairs"]["failed"] += len({one["what"] for row in asked for one in row.get("left_out", ())})
+        totals["pairs"]["of"] += max((row["asked"] for row in asked), default=0)
     return totals
 
 
@@ -254,8 +241,3 @@ def _versions() -> dict[str, str]:
         with suppress(importlib.metadata.PackageNotFoundError):
             versions[name] = importlib.metadata.version(name)
     return versions
-
-
-def _machine() -> dict[str, Any]:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {"cores": cores, "python": platform.python_version(), "platform": platform.platform()}
