@@ -145,7 +145,7 @@ def test_a_run_with_all_stages_is_reused_and_repeated(small_capture: Path, small
     assert first.returncode == 0, first.stdout + first.stderr
     rows = {row["stage"]: row for row in json.loads((run / "run.json").read_text())["stages"]}
     assert list(rows) == list(STAGES)
-    assert rows["retrieve"]["parameters"]["topk"] == rows["rerank"]["parameters"].get("topn", 30)
+    assert rows["retrieve"]["parameters"]["settings"]["topk"] == 30
     assert rows["localize"]["parameters"]["retrieval_dir"].endswith("reranked")
     assert rows["rerank"]["counts"]["pairs"] == 9
     table = (run / "SMALL" / "evaluation" / "overlap.csv").read_text()
