@@ -12,7 +12,9 @@ from toolkit.manifest import (
     Manifest,
     MapSettings,
     MatcherSettings,
+    PnpSettings,
     PredictorSettings,
+    RetrieveSettings,
     Settings,
     describe,
     load_manifest,
@@ -139,6 +141,12 @@ def test_a_wrong_base_is_named_with_its_heir(tmp_path: Path) -> None:
     assert text.startswith(f"{mine} inherits {mine}: a manifest cannot inherit from itself")
     text = message(mine="inherits: {a: b}")
     assert "inherits: found {'a': 'b'}, expected a file name or a list of them" in text
+
+
+def test_null_turns_a_part_off_and_leaves_a_section_as_it_is(tmp_path: Path) -> None:
+    manifest = load_manifest(write(tmp_path, "captures: [a]\nretrieve:\nlocalize: {map: null, pnp: null}\n"))
+    assert manifest.localize.map is None
+    assert (manifest.retrieve, manifest.localize.pnp) == (RetrieveSettings(), PnpSettings())
 
 
 def test_overrides_are_yaml_and_win(tmp_path: Path) -> None:
