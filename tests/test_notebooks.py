@@ -82,7 +82,7 @@ def test_parameters_are_of_the_run_or_settings_with_their_defaults(stage: str) -
 def test_a_stage_gets_the_parameters_of_its_notebook_and_then_its_dict(monkeypatch: pytest.MonkeyPatch) -> None:
     names = {"topk": 3, "index": "a variable of the user", "settings": {"mask": {"gps": True}}}
     monkeypatch.setattr(notebook, "_user_names", lambda: names)
-    folders = notebook.Folders({}, "retrieve")
+    folders = notebook.Folders("retrieve")
     assert folders.settings == RetrieveSettings.of({"topk": 3, "mask": {"gps": True}})
     names["settings"] = {"topk": 4}  # the cell has run again, with another value
     assert folders.settings.topk == 4
@@ -146,7 +146,7 @@ def test_a_run_with_all_stages_is_reused(small_capture: Path, small_run: Path, t
     assert first.returncode == 0, first.stdout + first.stderr
     rows = {row["stage"]: row for row in json.loads((run / "run.json").read_text())["stages"]}
     assert list(rows) == list(STAGES)
-    assert rows["retrieve"]["parameters"]["topk"] == rows["rerank"]["parameters"].get("topn", 30)
+    assert rows["retrieve"]["parameters"]["settings"]["topk"] == 30
     assert rows["localize"]["parameters"]["retrieval_dir"].endswith("reranked")
     assert rows["rerank"]["counts"]["pairs"] == 9
     table = (run / "SMALL" / "evaluation" / "overlap.csv").read_text()
