@@ -227,7 +227,7 @@ def _search(
     Raises:
         ArtifactError: a value is not finite.
     """
-    stacked = type(database.vectors).stack([query.vectors for query in queries.values()])  # type: ignore[misc]
+    stacked = Vectors.stack([query.vectors for query in queries.values()])
     backend: Backend = "faiss" if settings.use_faiss else "torch"
     masks = [query.masks for query in queries.values() if query.masks is not None]
     try:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from toolkit.capture import Capture, Session, masks
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_folders, open_descriptors, shows_upright
-from toolkit.embedders.index import JoinedIndex, VectorIndex, load_index
+from toolkit.embedders.index import VectorIndex, load_index
 from toolkit.embedders.search import search
 from toolkit.embedders.stored import embedder_fingerprint
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError
@@ -353,7 +353,7 @@ class Map:
             create_embedder(name, **({"vocabulary": folder / "vlad.npz"} if name == "vlad" else learned))
             for name, folder in zip(settings.models, folders, strict=True)
         ]
-        for embedder, vectors in zip(embedders, self._stored[0].each, strict=True):
+        for embedder, vectors in zip(embedders, self._stored[0].parts.values(), strict=True):
             if vectors.embedder not in ("", embedder_fingerprint(embedder.settings)):
                 raise ArtifactError(
                     f"{vectors.paths[0]} was made by another embedder or vocabulary than the run's {embedder.name} of "
@@ -384,7 +384,7 @@ class Map:
         return vectors[:] if small else vectors, rows
 
     @cached_property
-    def _index(self) -> VectorIndex | JoinedIndex | None:
+    def _index(self) -> VectorIndex | None:
         """The index of the descriptors, if the run has one."""
         settings = self.retrieve_settings.model_copy(update={"faiss_gpu": False})  # this machine may have no GPU
         return load_index(self._run.embeddings, f"{self.device}_map", self._stored[0], settings)
