@@ -37,13 +37,10 @@ class Problem:
     """One inconsistency."""
 
     session: str
-    file: str
-    """Relative to the session's folder."""
-    line: int
-    """Line number from 1; 0 if the problem concerns the whole file."""
+    file: str  # relative to the session's folder
+    line: int  # line number from 1; 0 if the problem concerns the whole file
     message: str
-    severity: str
-    """`error`: data are missing or wrong; `warning`: data may be wrong."""
+    severity: str  # `error`: data are missing or wrong; `warning`: data may be wrong
 
     def __str__(self) -> str:
         where = f"{self.session}/{self.file}" + (f":{self.line}" if self.line else "")

@@ -32,8 +32,7 @@ log = logging.getLogger(__name__)
 
 MAX_OFFSET_US = 100_000
 """Largest time between a photograph and the depth map of another sensor: half the period of the slowest, at 5 Hz."""
-MAX_GAP_US = 1_000_000
-"""Largest time between two poses of a sensor to interpolate between them."""
+MAX_GAP_US = 1_000_000  # largest time between two poses of a sensor to interpolate between them
 _MOST_POINTS = 30_000  # per depth map; enough for a few hundred features
 _HIDDEN = 1.1  # a point deeper than its nearest neighbor by this factor is occluded, or on an edge
 _CELL = 1.5  # width of a cell, in point spacings; only the nearest point of a cell is visible
@@ -46,14 +45,10 @@ _KEPT = 32  # photographs whose depth is cached
 class SeenDepth:
     """Depth at some pixels of a photograph."""
 
-    pixels: Floats
-    """(P, 2) pixels of the photograph, in row order from the top."""
-    depth_m: Floats
-    """(P,) depth along the photograph's optical axis, meters."""
-    cell_px: float = 1.0
-    """Width of the grid cells, pixels; each cell has at most one point."""
-    reason: str = ""
-    """Which depth maps were left out and why; without points, why there are none."""
+    pixels: Floats  # (P, 2) pixels of the photograph, in row order from the top
+    depth_m: Floats  # (P,) depth along the photograph's optical axis, meters
+    cell_px: float = 1.0  # width of the grid cells, pixels; each cell has at most one point
+    reason: str = ""  # which depth maps were left out and why; without points, why there are none
 
     def __len__(self) -> int:
         return len(self.depth_m)
@@ -98,12 +93,9 @@ def lifted(camera: pycolmap.Camera, pixels: Floats, depth_m: Floats) -> Floats:
 class _DepthMap:
     """A depth map that belongs to a photograph."""
 
-    path: str
-    """Path relative to raw_data/."""
-    camera: pycolmap.Camera | None
-    """Camera of the depth map; None: the photograph's camera, possibly resized."""
-    cam_from_depth: Floats
-    """(4, 4) pose of the depth sensor in the photograph's camera."""
+    path: str  # path relative to raw_data/
+    camera: pycolmap.Camera | None  # camera of the depth map; None: the photograph's camera, possibly resized
+    cam_from_depth: Floats  # (4, 4) pose of the depth sensor in the photograph's camera
 
 
 class DepthMaps:

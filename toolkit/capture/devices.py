@@ -14,8 +14,7 @@ from dataclasses import asdict, dataclass, field
 
 from toolkit.files import environment_variable
 
-EXTRA_DEVICES = "TOOLKIT_EXTRA_DEVICES"
-"""Environment variable with the rows that a manifest adds, in JSON."""
+EXTRA_DEVICES = "TOOLKIT_EXTRA_DEVICES"  # environment variable with the rows that a manifest adds, in JSON
 SPLITS = ("map", "query")
 
 
@@ -23,12 +22,9 @@ SPLITS = ("map", "query")
 class DeviceKind:
     """One kind of device."""
 
-    key: str
-    """Name in session folders, file names and tables."""
-    label: str
-    """Name in figures and the report."""
-    color: str
-    """Color in figures, #rrggbb."""
+    key: str  # name in session folders, file names and tables
+    label: str  # name in figures and the report
+    color: str  # color in figures, #rrggbb
     sessions: Mapping[str, str] = field(default_factory=dict)
     """Name of the session folder by split, for data sets that do not name it `<key>_<split>`."""
 

@@ -24,10 +24,8 @@ from toolkit.geometry import Floats, Ints
 
 Bools = NDArray[np.bool_]
 
-_BLOCK = 1 << 24
-"""Pairs of a query and a map image that are processed at a time."""
-_FAINTEST_DBM = -100.0
-"""Zero of the scale of strengths: weaker signals are hardly received."""
+_BLOCK = 1 << 24  # pairs of a query and a map image that are processed at a time
+_FAINTEST_DBM = -100.0  # zero of the scale of strengths: weaker signals are hardly received
 _ACCURACIES = 2.0
 """Radius that contains the true position in 99 % of cases if errors are normal, in stated accuracies (68 % radii)."""
 
@@ -36,12 +34,9 @@ _ACCURACIES = 2.0
 class Masks:
     """Which of N map images each of Q queries may retrieve; N / 8 bytes per distinct mask."""
 
-    count: int
-    """N, the number of map images."""
-    bits: NDArray[np.uint8]
-    """(M, N / 8) the distinct masks, the first map image in the lowest bit."""
-    which: Ints
-    """(Q,) row in `bits` of each query's mask; -1: all map images are allowed."""
+    count: int  # N, the number of map images
+    bits: NDArray[np.uint8]  # (M, N / 8) the distinct masks, the first map image in the lowest bit
+    which: Ints  # (Q,) row in `bits` of each query's mask; -1: all map images are allowed
 
     @classmethod
     def of(cls, masks: Iterable[Bools], which: Ints, count: int) -> "Masks":

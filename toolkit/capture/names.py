@@ -20,8 +20,7 @@ import pyarrow.compute as pc
 from toolkit.errors import CaptureError
 from toolkit.files import environment_variable
 
-ALLOW_OUTSIDE = "TOOLKIT_ALLOW_OUTSIDE"
-"""Environment variable; `1` allows images outside of the capture."""
+ALLOW_OUTSIDE = "TOOLKIT_ALLOW_OUTSIDE"  # environment variable; `1` allows images outside of the capture
 LINKED_HERE = "proc/links.txt"
 """File that `import` writes into a session of links: the inode of the session folder, which an archive cannot forge."""
 LONGEST = {"capture": 100, "session": 40, "subsession": 200}

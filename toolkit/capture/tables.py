@@ -31,8 +31,7 @@ Columns = Sequence[tuple[str, str]]
 # Column types. METERS is a bounded coordinate, ID a valid name, PATH the path of an image, TEXT any text.
 INTEGER, NUMBER, METERS, LATITUDE, LONGITUDE = "integer", "finite number", "meters", "latitude", "longitude"
 ID, PATH, TEXT = "id", "path", "text"
-FARTHEST_M = 1e12
-"""Largest coordinate, meters: beyond any place, and small enough that its square is finite."""
+FARTHEST_M = 1e12  # largest coordinate, meters: beyond any place, and small enough that its square is finite
 POSE_NAMES = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 POSE = tuple((name, NUMBER if name.startswith("q") else METERS) for name in POSE_NAMES)
 ALIGNED = "proc/alignment_trajectories.txt"
@@ -56,8 +55,7 @@ COLUMNS: dict[str, Columns] = {
 }
 """Names and types of the columns of each file of a session. Further columns of wifi.txt and bt.txt (name, times of the
 scan) are not used."""
-SIGNALS = ("wifi.txt", "bt.txt")
-"""Files whose keys may repeat, because a scan may receive an emitter several times."""
+SIGNALS = ("wifi.txt", "bt.txt")  # files whose keys may repeat, because a scan may receive an emitter several times
 
 
 def key_of(file: str) -> list[str]:
@@ -71,14 +69,11 @@ class TextTable:
     """The well-formed rows of a text file, and the problems of its other lines."""
 
     path: Path
-    columns: dict[str, pa.Array]
-    """Values by column name; `extra`, if requested, holds the text after the last column."""
-    lines: Ints
-    """Line number of each row, from 1."""
+    columns: dict[str, pa.Array]  # values by column name; `extra`, if requested, holds the text after the last column
+    lines: Ints  # line number of each row, from 1
     problems: list[tuple[int, str]]
     """Line number (0 for the whole file) and fault of each malformed line; these lines are not in `columns`."""
-    has_extra: bool
-    """Whether any line has more columns than expected."""
+    has_extra: bool  # whether any line has more columns than expected
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -169,8 +164,7 @@ def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = 
     return table
 
 
-_MOST = {METERS: FARTHEST_M, LATITUDE: 90.0, LONGITUDE: 180.0}
-"""Largest absolute value of each bounded column type."""
+_MOST = {METERS: FARTHEST_M, LATITUDE: 90.0, LONGITUDE: 180.0}  # largest absolute value of each bounded column type
 _ARROW_TYPES = {
     INTEGER: pa.int64(),
     **dict.fromkeys((NUMBER, *_MOST), pa.float64()),

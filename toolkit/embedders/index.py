@@ -23,8 +23,7 @@ from toolkit.manifest import RetrieveSettings
 log = logging.getLogger(__name__)
 faiss: Any = typed_faiss  # its type stubs are incomplete
 
-EXACT = "Flat"
-"""Factory string of the exact search, which needs no index."""
+EXACT = "Flat"  # factory string of the exact search, which needs no index
 _BLOCK_BYTES = 128 << 20  # vectors added to an index at a time, bytes of float32: bounds the memory
 _TRAIN_BYTES = 1 << 30  # training vectors of an index, at most, bytes of float32
 _TRAIN_PER_UNIT = 64  # training vectors per PCA dimension and per cell of an inverted file, if the map has as many
@@ -36,10 +35,8 @@ class VectorIndex:
     """FAISS indexes of N vectors, one per descriptor. Each contributes candidates."""
 
     indexes: tuple[Any, ...]
-    count: int
-    """Candidates of each index per query."""
-    nprobe: int | None = None
-    """Cells of an inverted file searched per query; None: 1/32 of them, at least 16."""
+    count: int  # candidates of each index per query
+    nprobe: int | None = None  # cells of an inverted file searched per query; None: 1/32 of them, at least 16
 
     @property
     def candidates(self) -> int:

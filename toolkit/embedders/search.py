@@ -25,8 +25,7 @@ _EXTRA = 16  # candidates beyond k: rounding in the backend may swap neighbors
 _GAMMA = 0.5
 
 _Floats = NDArray[np.float32]
-Found = tuple[_Floats, Ints]
-"""Scores and rows (Q, K) of the best database vectors of each query, best first."""
+Found = tuple[_Floats, Ints]  # scores and rows (Q, K) of the best database vectors of each query, best first
 _Best = Callable[[_Floats, int, int], Found]
 """Maps a block of the database, the number of its first row, and n to the n best scores and rows of each query, counted
 from the start of the block."""

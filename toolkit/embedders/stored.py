@@ -25,15 +25,11 @@ class StoredVectors:
     """One descriptor of images: selected rows of `.npy` matrices that are concatenated along axis 0."""
 
     paths: tuple[Path, ...]
-    starts: tuple[int, ...]
-    """First row of each file in the concatenation, then the total number of rows."""
+    starts: tuple[int, ...]  # first row of each file in the concatenation, then the total number of rows
     dim: int
-    rows: Ints
-    """The selected rows of the concatenation, in any order."""
-    normalize: bool = False
-    """Whether to scale vectors to length 1 when reading."""
-    embedder: str = ""
-    """Identifies the embedder, see `embedder_fingerprint`; empty: unknown."""
+    rows: Ints  # the selected rows of the concatenation, in any order
+    normalize: bool = False  # whether to scale vectors to length 1 when reading
+    embedder: str = ""  # identifies the embedder, see `embedder_fingerprint`; empty: unknown
 
     def __getitem__(self, positions: slice | Ints) -> NDArray[np.float32]:
         """Read the rows (n, D) at these positions."""
@@ -60,8 +56,7 @@ class StoredVectors:
 class Vectors:
     """One or several descriptors of the same N images; a row holds those of an image side by side."""
 
-    parts: Mapping[str, StoredVectors]
-    """Vectors by the name of the descriptor; the name of a single one is empty."""
+    parts: Mapping[str, StoredVectors]  # vectors by the name of the descriptor; the name of a single one is empty
 
     @classmethod
     def stack(cls, sets: Sequence["Vectors"]) -> "Vectors":

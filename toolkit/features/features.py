@@ -14,8 +14,7 @@ from toolkit.features.rootsift import rootsift_64
 from toolkit.geometry import Ints
 from toolkit.manifest import AUTO, FeaturesSettings, checkpoint_of, nearest
 
-DESCRIPTOR_SCALE = 512.0
-"""Factor by which RootSIFT vectors of length 1 are stored as uint8, as in COLMAP."""
+DESCRIPTOR_SCALE = 512.0  # factor by which RootSIFT vectors of length 1 are stored as uint8, as in COLMAP
 Descriptors = NDArray[np.uint8] | NDArray[np.float16] | NDArray[np.float32]
 
 
@@ -23,16 +22,13 @@ Descriptors = NDArray[np.uint8] | NDArray[np.float16] | NDArray[np.float32]
 class LocalFeatures:
     """Local features of one image as it is stored, strongest response first."""
 
-    keypoints: NDArray[np.float32]
-    """(N, 2) x y, pixels; the center of the top-left pixel is (0.5, 0.5)."""
+    keypoints: NDArray[np.float32]  # (N, 2) x y, pixels; the center of the top-left pixel is (0.5, 0.5)
     scales: NDArray[np.float32]
     """(N,) size of the keypoints, as standard deviation of the blob, pixels; 1 for detectors without scale."""
-    scores: NDArray[np.float32]
-    """(N,) response of the detector, larger is better; comparable only within one kind."""
+    scores: NDArray[np.float32]  # (N,) response of the detector, larger is better; comparable only within one kind
     descriptors: Descriptors
     """(N, D) unit vectors; or uint8, non-negative unit vectors times `DESCRIPTOR_SCALE` (RootSIFT)."""
-    image_size: tuple[int, int]
-    """Width and height of the image, pixels."""
+    image_size: tuple[int, int]  # width and height of the image, pixels
     turns: int = 0
     """Counter-clockwise quarter turns applied to the image before extraction. Keypoints are in the image as stored."""
 
@@ -66,12 +62,9 @@ class LocalFeatures:
 class Extractor(Protocol):
     """Extracts local features of one kind."""
 
-    color: bool
-    """Whether `extract` takes RGB images (H, W, 3) or gray ones (H, W)."""
-    batch_size: int
-    """The fastest number of images per call."""
-    threaded: bool
-    """Whether it is fastest to call `extract` with one image at a time from several threads."""
+    color: bool  # whether `extract` takes RGB images (H, W, 3) or gray ones (H, W)
+    batch_size: int  # the fastest number of images per call
+    threaded: bool  # whether it is fastest to call `extract` with one image at a time from several threads
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -81,8 +74,7 @@ class Extractor(Protocol):
         """Return the features of uint8 images of any sizes."""
 
 
-Shorten = Callable[[NDArray[np.float32]], NDArray[np.float32]]
-"""Unit descriptors (N, D) -> shorter unit vectors."""
+Shorten = Callable[[NDArray[np.float32]], NDArray[np.float32]]  # unit descriptors (N, D) -> shorter unit vectors
 
 
 def shorten_settings(shorten: Shorten | None) -> dict[str, str]:
@@ -94,18 +86,13 @@ def shorten_settings(shorten: Shorten | None) -> dict[str, str]:
 class FeatureKind:
     """How one kind of local features is extracted and matched. Scores are cosine similarities of descriptors."""
 
-    extractor: str
-    """`module:callable` that makes the extractor; imported when needed."""
+    extractor: str  # `module:callable` that makes the extractor; imported when needed
     matchers: tuple[str, ...]
     """Keys of `toolkit.features.matching.MATCHERS` that can match queries with references, the default first."""
-    ratio: float
-    """Lowe's ratio of `mutual` between a query and a reference; 1: no ratio test."""
-    min_score: float
-    """Smallest score of a `mutual` match between a query and a reference."""
-    epipolar_min_score: float
-    """Smallest score of a match between map images along an epipolar line."""
-    guided_min_score: float
-    """Smallest score of a guided match, near the projection of a map point."""
+    ratio: float  # Lowe's ratio of `mutual` between a query and a reference; 1: no ratio test
+    min_score: float  # smallest score of a `mutual` match between a query and a reference
+    epipolar_min_score: float  # smallest score of a match between map images along an epipolar line
+    guided_min_score: float  # smallest score of a guided match, near the projection of a map point
     scale_octaves: float
     """Largest difference between the size of a keypoint and the size that the map predicts, in octaves."""
     upright: bool = True

@@ -40,16 +40,14 @@ from toolkit.threads import fixed_sums
 
 log = logging.getLogger(__name__)
 
-MIN_CONFIDENCE = 0.1
-"""Smallest confidence of a match of a learned matcher."""
+MIN_CONFIDENCE = 0.1  # smallest confidence of a match of a learned matcher
 
 
 @dataclass(frozen=True)
 class PairMatches:
     """K matches of the features of two images."""
 
-    indices: Ints
-    """(K, 2) index of the first image's feature, index of the second's; no feature is matched twice."""
+    indices: Ints  # (K, 2) index of the first image's feature, index of the second's; no feature is matched twice
     scores: NDArray[np.float32]
     """(K,) cosine similarity of the descriptors, or confidence of a network; larger is better."""
 
@@ -64,8 +62,7 @@ class PairMatches:
 class Matcher(Protocol):
     """Matches the features of images without known poses."""
 
-    batch_size: int
-    """The fastest number of pairs per call."""
+    batch_size: int  # the fastest number of pairs per call
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -216,8 +213,7 @@ class MutualMatcher:
 class LocalMethod:
     """One kind of local features, with its extractor and matcher."""
 
-    name: str
-    """A key of `KINDS`."""
+    name: str  # a key of `KINDS`
     extractor: Extractor
     matcher: Matcher
 
@@ -325,12 +321,9 @@ def _two_best(scores: NDArray[np.float32]) -> tuple[Ints, NDArray[np.float32]]:
     return best, second
 
 
-_BLOCK = 64
-"""Number of rays that are compared with the same rays of the other image."""
-_BLOCKS_AT_ONCE = 8
-"""Number of blocks that are processed at once."""
-_FAR_REACH = 0.1
-"""Reach of a ray, radians, from which it is compared apart."""
+_BLOCK = 64  # number of rays that are compared with the same rays of the other image
+_BLOCKS_AT_ONCE = 8  # number of blocks that are processed at once
+_FAR_REACH = 0.1  # reach of a ray, radians, from which it is compared apart
 
 
 @fixed_sums

@@ -28,12 +28,9 @@ class NetworkExtractor(Remade):
 
     color: bool
     threaded = False
-    name: ClassVar[str]
-    """Key of the features in `KINDS`."""
-    title: ClassVar[str]
-    """Name of the network in messages."""
-    min_long_side = 0
-    """Smaller images are enlarged to this length of the longer side, pixels."""
+    name: ClassVar[str]  # key of the features in `KINDS`
+    title: ClassVar[str]  # name of the network in messages
+    min_long_side = 0  # smaller images are enlarged to this length of the longer side, pixels
     defaults: ClassVar[AlikedSettings | SuperPointSettings]
 
     def __init__(

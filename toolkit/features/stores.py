@@ -29,8 +29,7 @@ from toolkit.threads import one_thread
 
 log = logging.getLogger(__name__)
 
-KEPT_IMAGES = 256
-"""Number of images whose features `OnDemandFeatures` keeps in memory."""
+KEPT_IMAGES = 256  # number of images whose features `OnDemandFeatures` keeps in memory
 
 _Todo = tuple[str, str, int, int]
 """An image to extract features from: name, fingerprint of the sources, row of the session, quarter turns."""

@@ -17,14 +17,11 @@ from toolkit.manifest import SuperPointSettings
 from toolkit.models.weights import SUPERPOINT, given_or_resolved, load_checkpoint
 
 DESCRIPTOR_LENGTH = 256
-_CELL = 8
-"""Side of the cells of the network's coarsest grid, pixels."""
-MIN_RESPONSE = 0.005
-"""Smallest response of a keypoint; responses are at most 1."""
+_CELL = 8  # side of the cells of the network's coarsest grid, pixels
+MIN_RESPONSE = 0.005  # smallest response of a keypoint; responses are at most 1
 NMS_RADIUS = 4
 """Radius of non-maximum suppression, pixels of the resized image: two keypoints are further apart in x or in y."""
-BORDER = 4
-"""Keypoints closer to the image border than this are dropped, pixels of the resized image."""
+BORDER = 4  # keypoints closer to the image border than this are dropped, pixels of the resized image
 
 
 class SuperPointExtractor(NetworkExtractor):

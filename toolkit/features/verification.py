@@ -16,12 +16,9 @@ from toolkit.geometry import Floats, Ints
 from toolkit.manifest import RerankSettings
 from toolkit.threads import fixed_sums
 
-MAP_IMAGES_KEPT = 256
-"""Number of map images whose features stay in memory, about 60 MB."""
-MAX_ERROR_DEG = 0.2
-"""Largest Sampson error of an inlier, as an angle seen from the camera, degrees."""
-MAX_TRIALS = 500
-"""Largest number of RANSAC samples, of five matches each; the best matches are sampled first."""
+MAP_IMAGES_KEPT = 256  # number of map images whose features stay in memory, about 60 MB
+MAX_ERROR_DEG = 0.2  # largest Sampson error of an inlier, as an angle seen from the camera, degrees
+MAX_TRIALS = 500  # largest number of RANSAC samples, of five matches each; the best matches are sampled first
 
 
 class Verifier:
@@ -74,12 +71,9 @@ class Verifier:
 class Verified(NamedTuple):
     """The matches that agree with one essential matrix."""
 
-    inliers: Ints
-    """(A,) indices of these matches."""
-    distinct: int
-    """Their number; those that share a keypoint count once."""
-    essential: Floats
-    """(3, 3) the essential matrix."""
+    inliers: Ints  # (A,) indices of these matches
+    distinct: int  # their number; those that share a keypoint count once
+    essential: Floats  # (3, 3) the essential matrix
 
 
 @fixed_sums
