@@ -124,11 +124,9 @@ class DepthMaps:
         for source in sources:
             try:
                 points_of_map, spacing_px = self._points(source, camera)
+                points, spacing = [*points, points_of_map], max(spacing, spacing_px)
             except CaptureError as error:
                 reasons.append(str(error))
-                continue
-            points.append(points_of_map)
-            spacing = max(spacing, spacing_px)
         with self._lock:
             new = [reason for reason in reasons if reason not in self._logged]
             self._logged.update(new)
@@ -229,10 +227,8 @@ class DepthMaps:
         camera = source.camera or photograph
         resized = source.camera is None and abs(width - height * camera.width / camera.height) <= 1
         if not resized and (width, height) != (camera.width, camera.height):
-            raise CaptureError(
-                f"Depth map {path}: found {width} x {height} pixels, expected {camera.width} x {camera.height} as in "
-                "sensors.txt" + (", or a smaller size of that aspect ratio." if source.camera is None else ".")
-            )
+            expected = f"{camera.width} x {camera.height}" + (", or that aspect ratio" if source.camera is None else "")
+            raise CaptureError(f"Depth map {path}: found {width} x {height} pixels, expected {expected}.")
         step = int(np.ceil(np.sqrt(max(np.count_nonzero(depth) / _MOST_POINTS, 1.0))))
         y, x = np.nonzero(depth[step // 2 :: step, step // 2 :: step])
         y, x = y * step + step // 2, x * step + step // 2

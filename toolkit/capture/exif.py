@@ -84,10 +84,9 @@ def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
         focal_px = focal_mm * plane_x / unit_mm * (width / stored if stored > 0 else 1.0)
         how = "FocalLength and FocalPlaneXResolution"
     else:
-        raise ImageError(
-            "no focal length in EXIF: give the intrinsics with --camera 'MODEL,W,H,...', such as "
-            f"'SIMPLE_PINHOLE,{width},{height},FOCAL_PX,{width / 2:g},{height / 2:g}', with --cameras, or in the table"
-        )
+        such_as = f"'SIMPLE_PINHOLE,{width},{height},FOCAL_PX,{width / 2:g},{height / 2:g}'"
+        options = f"--camera 'MODEL,W,H,...', such as {such_as}, with --cameras, or in the table"
+        raise ImageError(f"no focal length in EXIF: give the intrinsics with {options}")
     params = [float(focal_px), width / 2, height / 2]
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
     return camera, f"a guess from EXIF ({how}), without distortion"

@@ -55,8 +55,7 @@ def _open(path: str | Path) -> Iterator[BinaryIO]:
         if not stat.S_ISREG(status.st_mode):  # opening a pipe blocks forever, reading a device never ends
             raise ImageError(f"Image cannot be read: {path} is a folder, a pipe or a device, expected a file")
         if status.st_size > MOST_BYTES:
-            size = f"{status.st_size:,} bytes, expected at most {MOST_BYTES:,}"
-            raise ImageError(f"Image cannot be read: {path} has {size}")
+            raise ImageError(f"Image cannot be read: {path} has more than {MOST_BYTES:,} bytes")
         with open(path, "rb") as stream:
             yield stream
     except FileNotFoundError:
@@ -73,7 +72,7 @@ def stored_size(path: str | Path) -> tuple[int, int]:
     """
     with _open(path) as stream:
         try:
-            return _header_size(stream)
+            return open_lazily(stream, np.inf).size
         except HEADER_ERRORS as error:
             raise ImageError(f"Image cannot be decoded ({error}): {path}") from None
 
@@ -88,10 +87,6 @@ def open_lazily(stream: BinaryIO, most_pixels: float = MOST_PIXELS) -> PIL.Image
     return image
 
 
-def _header_size(stream: BinaryIO) -> tuple[int, int]:
-    return open_lazily(stream, np.inf).size
-
-
 def decode(path: str | Path, flags: int, least_side: int | None = None, longest: int | None = None) -> NDArray[Any]:
     """Return the pixels of an image file as OpenCV decodes it with `flags`.
 
@@ -102,35 +97,23 @@ def decode(path: str | Path, flags: int, least_side: int | None = None, longest:
         ImageError: see `read_file`; or the file is not an image, is truncated, or has more than `MOST_PIXELS` pixels.
     """
     data = read_file(path)
+    size = 0, 0
     try:
-        width, height = _header_size(BytesIO(data))
-    except PIL.Image.DecompressionBombError as error:
-        raise ImageError(f"Image cannot be decoded ({error}): {path}") from None
-    except HEADER_ERRORS:
-        width = height = 0  # OpenCV decides whether it is an image
-    if width * height > MOST_PIXELS:
-        raise ImageError(f"Image cannot be decoded ({width} x {height} pixels, more than {MOST_PIXELS:,}): {path}")
-    if data.startswith(b"\xff\xd8"):  # reducing saves time only for JPEG
-        if least_side is not None:
-            flags |= _reduced(width, height, min(width, height) // least_side)
-        elif longest is not None:
-            flags |= _reduced(width, height, max(width, height) // longest)
-    try:
+        with suppress(*HEADER_ERRORS[:-1]):  # OpenCV decides whether it is an image
+            size = open_lazily(BytesIO(data), np.inf).size
+        if np.prod(size) > MOST_PIXELS:
+            raise ValueError(f"{size[0]} x {size[1]} pixels, more than {MOST_PIXELS:,}")
+        if data.startswith(b"\xff\xd8") and (least_side or longest):  # reducing saves time only for JPEG
+            most = min(size) // least_side if least_side else max(size) // (longest or 1)
+            # With a remainder, the last row and column would cover fewer pixels and shift all others.
+            fitting = (flag for factor, flag in _REDUCED.items() if factor <= most and not np.any(np.mod(size, factor)))
+            flags |= next(fitting, 0)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    except cv2.error as error:
-        raise ImageError(f"Image cannot be decoded ({error.err}): {path}") from None
+    except (ValueError, cv2.error, PIL.Image.DecompressionBombError) as error:
+        raise ImageError(f"Image cannot be decoded ({getattr(error, 'err', error)}): {path}") from None
     if image is None:
         raise ImageError(f"Image cannot be decoded ({len(data)} bytes; expected a whole JPEG or PNG): {path}")
     return np.asarray(image)
-
-
-def _reduced(width: int, height: int, most: int) -> int:
-    """Return the OpenCV flag that decodes a JPEG of this size reduced by at most this factor; 0 for full size."""
-    for factor, flag in _REDUCED.items():
-        # With a remainder, the last row and column would cover fewer pixels and shift all others.
-        if width % factor == height % factor == 0 and factor <= most:
-            return flag
-    return 0
 
 
 def read_image(

@@ -49,10 +49,8 @@ class Trajectory:
         self.arrow_ids = as_strings(device_ids)
         self.qt = np.asarray(qt, np.float64).reshape(-1, 7)
         if not len(self.timestamps) == len(self.arrow_ids) == len(self.qt):
-            raise ValueError(
-                f"Expected equally many timestamps, device ids and poses, got {len(self.timestamps)}, "
-                f"{len(self.arrow_ids)} and {len(self.qt)}."
-            )
+            found = f"{len(self.timestamps)}, {len(self.arrow_ids)} and {len(self.qt)}"
+            raise ValueError(f"Expected equally many timestamps, device ids and poses, got {found}.")
         self._covariances = None if covariances is None else np.asarray(covariances, np.float64).reshape(-1, 6, 6)
         self._source = source
 
@@ -75,12 +73,9 @@ class Trajectory:
     @classmethod
     def from_table(cls, table: TextTable) -> "Trajectory":
         """Make a trajectory from the table of a trajectories file."""
-        return cls(
-            table.columns["timestamp"].to_numpy(),
-            table.columns["device_id"],
-            table.numbers(POSE_NAMES),
-            source=table.path if table.has_extra and not table.problems else None,
-        )
+        source = table.path if table.has_extra and not table.problems else None
+        times, devices = table.columns["timestamp"].to_numpy(), table.columns["device_id"]
+        return cls(times, devices, table.numbers(POSE_NAMES), source=source)
 
     def write(self, path: str | Path) -> None:
         """Write the file atomically, with numbers that read back exactly. NaN covariances are omitted."""
@@ -90,11 +85,8 @@ class Trajectory:
             flat = covariances.reshape(-1, 36).tolist()
             values = [[*pose, *more] if has else pose for pose, more, has in zip(values, flat, finite, strict=True)]
         rows = zip(self.timestamps.tolist(), self.arrow_ids.to_pylist(), values, strict=True)
-        write_table(
-            Path(path),
-            "timestamp, device_id, qw, qx, qy, qz, tx, ty, tz, *covar",
-            (f"{time}, {device}, {', '.join(map(repr, numbers))}" for time, device, numbers in rows),
-        )
+        lines = (f"{time}, {device}, {', '.join(map(repr, numbers))}" for time, device, numbers in rows)
+        write_table(Path(path), "timestamp, device_id, qw, qx, qy, qz, tx, ty, tz, *covar", lines)
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -112,23 +104,20 @@ class Trajectory:
         """
         if self._covariances is None and self._source is not None:
             table = read_table(self._source, COLUMNS["trajectories.txt"], extra=True)
-            extra = table.columns["extra"]
+            extra, self._source = table.columns["extra"], None
             rows = np.flatnonzero(pc.equal(pc.count_substring(extra, ","), 35).to_numpy(zero_copy_only=False))
-            if len(rows):
-                self._covariances = np.full((len(self), 6, 6), np.nan)
-                malformed = list[int]()
-                for start in range(0, len(rows), 4096):
-                    block = rows[start : start + 4096]
-                    values = pc.split_pattern(extra.take(pa.array(block)), ",").flatten()
-                    numbers, wrong = convert(pc.ascii_trim_whitespace(values), NUMBER)
-                    self._covariances[block] = numbers.to_numpy().reshape(-1, 6, 6)
-                    malformed += block[wrong.reshape(-1, 36).any(axis=1)].tolist()
-                if malformed:
-                    self._covariances[malformed] = np.nan
-                    more = f", and in {len(malformed) - 1} more lines" if len(malformed) > 1 else ""
-                    log.warning("%s: the covariance has values that are not finite numbers%s; such a covariance is not "
-                                "used.", table.where(malformed[0]), more)  # fmt: skip
-            self._source = None
+            covariances = np.full((len(self), 6, 6), np.nan)
+            for block in np.split(rows, range(4096, len(rows), 4096)):  # bounds the memory
+                values = pc.split_pattern(extra.take(pa.array(block)), ",").flatten()
+                numbers, wrong = convert(pc.ascii_trim_whitespace(values), NUMBER)
+                finite = ~wrong.reshape(-1, 36).any(axis=1)
+                covariances[block[finite]] = numbers.to_numpy().reshape(-1, 6, 6)[finite]
+            malformed = rows[np.isnan(covariances[rows, 0, 0])]
+            if len(malformed):
+                more = f", and in {len(malformed) - 1} more lines" if len(malformed) > 1 else ""
+                fault = f"the covariance has values that are not finite numbers{more}; such a covariance is not used"
+                log.warning("%s: %s.", table.where(malformed[0]), fault)
+            self._covariances = covariances if len(rows) else None
         return self._covariances
 
     @property

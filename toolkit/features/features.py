@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.capture.turning import turn_image, turn_points
+from toolkit.capture.upright import turn_image, turn_points
 from toolkit.errors import ManifestError
 from toolkit.features.rootsift import rootsift_64
 from toolkit.geometry import Ints

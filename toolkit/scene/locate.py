@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from toolkit.capture.cameras import camera_text, parse_camera
 from toolkit.capture.images import pixels_of, stored_size
-from toolkit.capture.turning import turn_image
+from toolkit.capture.upright import turn_image
 from toolkit.errors import ArtifactError, CameraError, ImageError
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
 from toolkit.features.matching import LocalMethod
