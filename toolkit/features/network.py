@@ -17,7 +17,7 @@ from toolkit.manifest import AlikedSettings, SuperPointSettings
 from toolkit.models.compute import Fitting, on_device, precision_of_matches, resolve_device
 from toolkit.models.weights import weights_digest
 
-_BATCH = 16
+NOT_FINITE = "Its weights may hold NaN: compare the file with the official one. Or float16 overflowed: use bfloat16."
 
 
 class NetworkExtractor(Remade):
@@ -59,7 +59,7 @@ class NetworkExtractor(Remade):
         self._values: Any = settings or self.defaults
         self._device = resolve_device(device)
         self._dtype = precision_of_matches(dtype, self._device)
-        self.batch_size = batch_size or (self._batch_on_cpu() if self._device.type == "cpu" else _BATCH)
+        self.batch_size = batch_size or (self._batch_on_cpu() if self._device.type == "cpu" else 16)
         model = self._load(checkpoint)
         self._weights = weights_digest(model)
         self._model: Any = on_device(model, self._device, self.title)
@@ -130,19 +130,11 @@ class NetworkExtractor(Remade):
     def _unpack(self, rows: NDArray[np.float32], resized: tuple[int, ...], shape: tuple[int, ...]) -> LocalFeatures:
         """Return the features of an image of shape `shape`, from the output of `_forward` for shape `resized`."""
         if not np.isfinite(rows).all():
-            raise ToolkitError(
-                f"{self.title} gave a response or a descriptor that is not finite. Its weights may contain NaN: "
-                "compare the file with the official one. With float16, numbers may have been too large: use bfloat16 "
-                "or float32."
-            )
+            raise ToolkitError(f"{self.title} gave a response or a descriptor that is not finite. {NOT_FINITE}")
         rows = rows[rows[:, 2] > 0]
         (resized_height, resized_width), (height, width) = resized[:2], shape[:2]
         # The network's pixel centers are at integers; resizing maps the corners of the image onto each other.
         keypoints = (rows[:, :2] + 0.5) * np.array([width / resized_width, height / resized_height])
-        return LocalFeatures(
-            keypoints.astype(np.float32),
-            np.ones(len(rows), np.float32),
-            rows[:, 2].copy(),
-            rows[:, 3:].astype(np.float16),  # gives the same 5,321 mutual matches of ALIKED as float32
-            (width, height),
-        )
+        descriptors = rows[:, 3:].astype(np.float16)  # gives the same 5,321 mutual matches of ALIKED as float32
+        scales, scores = np.ones(len(rows), np.float32), rows[:, 2].copy()
+        return LocalFeatures(keypoints.astype(np.float32), scales, scores, descriptors, (width, height))

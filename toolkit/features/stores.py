@@ -179,12 +179,7 @@ def extract_session(
 
 
 def _extract_into(
-    items: Items,
-    todo: Sequence[_Todo],
-    session: Session,
-    extractor: Extractor,
-    workers: int = 0,
-    label: str = "",
+    items: Items, todo: Sequence[_Todo], session: Session, extractor: Extractor, workers: int = 0, label: str = ""
 ) -> None:
     """Extract the features of images into a folder, or record why that failed. An empty `label` hides the bar."""
     with one_thread():  # images are processed in parallel instead
@@ -216,9 +211,8 @@ class OnDemandFeatures:
     def prepare(self, names: Iterable[str], workers: int, skip_existing: bool = True) -> FeatureStore:
         """Extract the features of images into the folder, and return them; see `extract_session`."""
         rows = np.array([self._session.row_of_name[name] for name in names], np.int64)
-        self._store = extract_session(
-            self._session, self._out, self._extractor, rows, workers, skip_existing, turns=self._turns
-        )
+        made = self._session, self._out, self._extractor, rows, workers, skip_existing
+        self._store = extract_session(*made, turns=self._turns)
         return self._store
 
     def __call__(self, name: str) -> LocalFeatures:
@@ -258,10 +252,8 @@ def _extract(
             return str(error)
         camera = session.camera(sensors[row])
         if image.shape[:2] != (camera.height, camera.width):
-            return (
-                f"Image of {image.shape[1]} x {image.shape[0]} pixels, but sensors.txt says {camera.width} x "
-                f"{camera.height} for {sensors[row]}: {session.image_path(row)}"
-            )
+            said = f"sensors.txt says {camera.width} x {camera.height} for {sensors[row]}: {session.image_path(row)}"
+            return f"Image of {image.shape[1]} x {image.shape[0]} pixels, but {said}"
         return image
 
     def read_and_extract(item: tuple[int, int]) -> LocalFeatures | str:
@@ -305,9 +297,7 @@ class MatchStore:
             KeyError: the folder does not have the pair.
             DamagedError: the matches are not what was written.
         """
-        step = next((step for step in (1, -1) if match_name(*names[::step]) in self._items), 0)
-        if not step:
-            raise KeyError(names)
+        step = 1 if match_name(*names) in self._items else -1
         arrays = self._items[match_name(*names[::step])]
         return PairMatches(arrays["indices"].astype(np.int64)[:, ::step], arrays["scores"].astype(np.float32))
 
@@ -349,10 +339,8 @@ def match_sessions(
     path = matches_path(out, *sessions, made_by)
     with Items(path, made_by, again=not skip_existing) as items:
         readable = dict.fromkeys((name0, name1) for name0, name1 in pairs if name0 in stores[0] and name1 in stores[1])
-        todo = items.left(
-            (match_name(*names), stores[0].made_from[names[0]] + stores[1].made_from[names[1]], *names)
-            for names in readable
-        )
+        sources = (stores[0].made_from[first] + stores[1].made_from[second] for first, second in readable)
+        todo = items.left((match_name(*names), source, *names) for names, source in zip(readable, sources, strict=True))
         label = f"{matcher.settings['name']} {' '.join(sessions)}"
         todo = items.spread(_match_into, todo, (stores, matcher, label), label, "pair", matcher.batch_size)
         _match_into(items, todo, stores, matcher, label)
@@ -360,11 +348,7 @@ def match_sessions(
 
 
 def _match_into(
-    items: Items,
-    todo: Sequence[_ToMatch],
-    stores: tuple[FeatureStore, FeatureStore],
-    matcher: Matcher,
-    label: str,
+    items: Items, todo: Sequence[_ToMatch], stores: tuple[FeatureStore, FeatureStore], matcher: Matcher, label: str
 ) -> None:
     """Add the matches of pairs to a folder."""
     with tqdm(total=len(todo), desc=label, unit="pair", disable=not todo) as bar:

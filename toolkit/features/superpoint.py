@@ -36,17 +36,12 @@ class SuperPointExtractor(NetworkExtractor):
         try:
             import transformers
         except ImportError as error:
-            raise ToolkitError(
-                f"{SUPERPOINT.model} needs the package transformers, which cannot be imported ({error}). Install it "
-                "in the folder of this project: python -m pip install --constraint constraints.txt --editable "
-                "'.[learned]'. Or use `sift` features, which need no other package."
-            ) from error
+            fault = f"{SUPERPOINT.model} needs the package transformers, which cannot be imported ({error})"
+            install = "python -m pip install --constraint constraints.txt --editable '.[learned]'"
+            raise ToolkitError(f"{fault}. In the folder of this project: {install}. Or use `sift` features.") from error
         # `_forward` limits border and number of keypoints, because only it knows the unpadded size of the image.
         config = transformers.SuperPointConfig(
-            keypoint_threshold=MIN_RESPONSE,
-            nms_radius=NMS_RADIUS,
-            max_keypoints=-1,
-            border_removal_distance=0,
+            keypoint_threshold=MIN_RESPONSE, nms_radius=NMS_RADIUS, max_keypoints=-1, border_removal_distance=0
         )
         with torch.device("meta"):
             network: nn.Module = transformers.SuperPointForKeypointDetection(config)

@@ -50,18 +50,11 @@ class Verifier:
         features = self._strongest(features)
         map_features = [self._map_features(name) for name in references]
         all_matches = self.matcher.match([(features, reference) for reference in map_features])
-        inliers = [
-            verified_matches(
-                camera,
-                features.keypoints[matches.indices[:, 0]],
-                reference_camera,
-                reference.keypoints[matches.indices[:, 1]],
-                matches.scores,
-                self.settings,
-                tests=len(references),
-            ).distinct
-            for matches, reference, reference_camera in zip(all_matches, map_features, cameras, strict=True)
-        ]
+        inliers = []
+        for matches, reference, reference_camera in zip(all_matches, map_features, cameras, strict=True):
+            pixels, in_map = features.keypoints[matches.indices[:, 0]], reference.keypoints[matches.indices[:, 1]]
+            pair = camera, pixels, reference_camera, in_map, matches.scores
+            inliers.append(verified_matches(*pair, self.settings, tests=len(references)).distinct)
         return inliers, [len(matches) for matches in all_matches]
 
     def _strongest(self, features: LocalFeatures) -> LocalFeatures:
