@@ -105,7 +105,7 @@ class TextTable:
         different = again[~self.frame(*self.columns).duplicated().to_numpy()[again]]
         row = int([*different, again[0]][0])
         first = self.lines[np.flatnonzero((keys == keys.iloc[row]).all(axis=1))[0]]
-        shown = f"{self.where(row)}: {', '.join(f'{name} {keys[name][row]!r}' for name in key)} again"
+        shown = f"{self.where(row)}: {', '.join(f'{name} {self.columns[name][row].as_py()!r}' for name in key)} again"
         if len(different):
             raise CaptureError(f"{shown}, with other values than in line {first}. Remove one of the two.")
         more = f", and {len(again) - 1} more such lines" if len(again) > 1 else ""

@@ -80,9 +80,7 @@ def resolve_name(name: str, checkpoint: str | Path | None = None) -> str:
 
 def resolve_model(model: str | list[str], checkpoint: str | Path | None = None) -> str | list[str]:
     """Apply `resolve_name` to a name, or to each of several names."""
-    if isinstance(model, str):
-        return resolve_name(model, checkpoint)
-    return [resolve_name(name, checkpoint) for name in model]
+    return resolve_name(model, checkpoint) if isinstance(model, str) else [resolve_name(n, checkpoint) for n in model]
 
 
 def shows_upright(embedder: Embedder, upright: bool | None) -> bool:

@@ -138,9 +138,8 @@ class Vlad:
             fault = f"{count} map images gave {len(sample)} local features"
             advice = "Check that they can be read and are not blank (`python -m toolkit check CAPTURE`)"
             raise ToolkitError(f"A VLAD vocabulary cannot be learned: {fault}. {advice}.")
-        arrays = _whitening(sample, LOCAL_DIM) | dict.fromkeys(
-            ("centroids", "projection"), np.zeros((0, 0), np.float32)
-        )
+        empty = np.zeros((0, 0), np.float32)
+        arrays = _whitening(sample, LOCAL_DIM) | {"centroids": empty, "projection": empty}
         local = cls(arrays)._whitened(sample)
         words = max(1, min(MAX_WORDS, len(local) // 8))
         arrays["centroids"] = _kmeans(local, words, ITERATIONS, np.concatenate(all_keys))
