@@ -294,7 +294,7 @@ def _masks(
 ) -> tuple[Masks | None, dict[str, int]]:
     """Return the map images that each query image may find, None: all; and columns of the pair's row."""
     mask = settings.mask
-    images = database.session, database.rows, query.session, query.rows
+    images = (database.session, database.rows), (query.session, query.rows)
     priors = dict[str, Masks]()
     if poses is not None:
         priors["poses"] = pose_masks(poses, *images, mask.poses_distance_m, MAX_ANGLE_DEG)

@@ -207,7 +207,7 @@ def _reason(error: RuntimeError) -> str:
 
 def _train(index: Any, vectors: Vectors) -> None:
     """Train PCA, if the index starts with it, then the rest. Behind PCA vectors are shorter, so more fit in memory."""
-    rng, pca = np.random.default_rng(0), None
+    rng, pca = np.random.default_rng(0), list[Any]()
     last = index = faiss.downcast_index(index)
 
     def sample(dim: int, most: int) -> NDArray[np.float32]:
@@ -216,12 +216,13 @@ def _train(index: Any, vectors: Vectors) -> None:
         samples = np.empty((count, dim), np.float32)
         for start, block in blocks(vectors.choose(rows), _BLOCK_BYTES):
             require_finite(block, "database", rows[start:])
-            samples[start : start + len(block)] = pca.apply(block) if pca is not None and pca.is_trained else block
+            samples[start : start + len(block)] = pca[0].apply(block) if pca else block
         return samples
 
     if isinstance(index, faiss.IndexPreTransform):
-        last, pca = faiss.downcast_index(index.index), faiss.downcast_VectorTransform(index.chain.at(0))
-        _train_pca(pca, sample(pca.d_in, _TRAIN_PER_UNIT * pca.d_out))
+        last, first = faiss.downcast_index(index.index), faiss.downcast_VectorTransform(index.chain.at(0))
+        _train_pca(first, sample(first.d_in, _TRAIN_PER_UNIT * first.d_out))
+        pca.append(first)
     if not last.is_trained:
         most = max(_TRAIN_PER_UNIT * last.nlist, _TRAIN_CODES) if isinstance(last, faiss.IndexIVF) else 1 << 20
         last.train(sample(last.d, most))

@@ -69,7 +69,7 @@ class Vectors:
                 starts += [starts[-1] + start for start in part.starts[1:]]
             paths = tuple(path for part in parts for path in part.paths)
             embedder = next((part.embedder for part in parts if part.embedder), "")
-            joined = {"paths": paths, "starts": tuple(starts), "rows": np.concatenate(rows), "embedder": embedder}
+            joined: Any = {"paths": paths, "starts": tuple(starts), "rows": np.concatenate(rows), "embedder": embedder}
             stacked[name] = replace(parts[0], **joined)
         return cls(stacked)
 
