@@ -22,8 +22,7 @@ from toolkit.capture.masks import Masks
 from toolkit.embedders import megaloc, search
 from toolkit.features import lightglue, network
 from toolkit.features.lightglue import LightGlueMatcher
-from toolkit.features.network import NetworkExtractor
-from toolkit.features.superpoint import SuperPointExtractor
+from toolkit.features.network import NetworkExtractor, SuperPointExtractor
 from toolkit.manifest import AlikedSettings, SuperPointSettings
 from toolkit.models.vggt import VGGT
 from toolkit.prediction import network as predictors

@@ -106,14 +106,14 @@ KINDS: dict[str, FeatureKind] = {
     # Scores of unrelated patches scatter around 0, and similar patches are common: the usual test is a distance below
     # 0.7 (hloc's NN-superpoint), a cosine of 1 - 0.7^2 / 2, without a ratio test. All keypoints have the same size.
     "superpoint": FeatureKind(
-        "toolkit.features.superpoint:SuperPointExtractor", ("lightglue", "mutual"), 1.0, 0.755,
+        "toolkit.features.network:SuperPointExtractor", ("lightglue", "mutual"), 1.0, 0.755,
         epipolar_min_score=0.755, guided_min_score=0.755, scale_octaves=float("inf"),
     ),
     # Measured on photographs by day and by simulated night (STRECHA, STRECHA_HARD): 97 % and 93 % of the mutual matches
     # above 0.7 are correct. In searches within 0.7 degrees, 0.4 % of unrelated features score above 0.5, and 93 % of
     # the true partners by night. With a wrong relative pose, 0.1 % of the matches along epipolar lines remain.
     "aliked": FeatureKind(
-        "toolkit.features.aliked:AlikedExtractor", ("lightglue", "mutual"), 1.0, 0.7,
+        "toolkit.features.network:AlikedExtractor", ("lightglue", "mutual"), 1.0, 0.7,
         epipolar_min_score=0.5, guided_min_score=0.5, scale_octaves=float("inf"),
     ),
 }  # fmt: skip
