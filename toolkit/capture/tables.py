@@ -292,27 +292,21 @@ class KeyIndex:
 
     def __init__(self, timestamps: Ints, ids: Any) -> None:
         ids = as_strings(ids)
-        self._times = np.unique(timestamps)
-        self._ids = pc.unique(ids)
+        self._times, self._ids = pd.Index(np.unique(timestamps)), pc.unique(ids)
         keys = self._keys(timestamps, ids)
         self._order = np.argsort(keys, kind="stable")
         self._sorted = keys[self._order]
 
     def _keys(self, timestamps: Ints, ids: Any) -> Ints:
-        times = np.searchsorted(self._times, timestamps)
-        codes = codes_of(as_strings(ids), self._ids)
-        known = (codes >= 0) & (times < len(self._times))
-        if len(self._times):
-            known &= self._times[np.minimum(times, len(self._times) - 1)] == timestamps
-        return np.where(known, times * len(self._ids) + codes, -1)
+        times, codes = self._times.get_indexer(timestamps), codes_of(as_strings(ids), self._ids)
+        return np.where((times >= 0) & (codes >= 0), times * len(self._ids) + codes, -1)
 
     def find(self, timestamps: Ints, ids: Any) -> Ints:
         """Return the first row with each key, (n,) int64, -1 without any."""
         keys = self._keys(timestamps, ids)
-        if not len(self._sorted):
-            return np.full(len(keys), -1, np.int64)
-        nearest = np.minimum(np.searchsorted(self._sorted, keys), len(self._sorted) - 1)
-        return np.where((self._sorted[nearest] == keys) & (keys >= 0), self._order[nearest], -1)
+        first = np.searchsorted(self._sorted, keys)
+        found = (np.append(self._sorted, -1)[first] == keys) & (keys >= 0)
+        return np.where(found, np.append(self._order, -1)[first], -1)
 
     def find_all(self, timestamps: Ints, ids: Any) -> list[Ints]:
         """Return all rows with each key, in the table's order."""

@@ -44,11 +44,8 @@ class LightGlueMatcher(Remade):
     ) -> None:
         """
         Args:
-            checkpoint: an official file of the authors or of the hub, or its tensors by name; None: take it from an
-                installed package or a cache, or download it.
-            device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
-            dtype: precision of the layers' matrix products: `float32`, `bfloat16`, `float16`; `auto`: the fastest on
-                the device. Positions and the assignment are always computed in float32.
+            checkpoint, device, dtype: see `NetworkExtractor`; the file is one of the authors or of the hub. Positions
+                and the assignment are always computed in float32.
             batch_size: largest number of pairs per batch; None: depends on the device.
             min_score: smallest confidence of a match, from 0 to 1.
             features: kind of the features, `superpoint` or `aliked`.

@@ -209,7 +209,7 @@ class SuperPointExtractor(NetworkExtractor):
             install = "python -m pip install --constraint constraints.txt --editable '.[learned]'"
             raise ToolkitError(f"{fault}. In the folder of this project: {install}. Or use `sift` features.") from error
         # `_forward` limits border and number of keypoints, because only it knows the unpadded size of the image.
-        limits = {"keypoint_threshold": self.min_response, "nms_radius": self.nms_radius}
+        limits: Any = {"keypoint_threshold": self.min_response, "nms_radius": self.nms_radius}
         config = transformers.SuperPointConfig(**limits, max_keypoints=-1, border_removal_distance=0)
         with torch.device("meta"):
             network: nn.Module = transformers.SuperPointForKeypointDetection(config)

@@ -7,6 +7,7 @@ have one folder of matches per kind and settings, with an item per pair of image
 import logging
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -42,28 +43,18 @@ def features_path(out: str | Path, session_id: str, settings: Mapping[str, Any])
     return Path(out) / session_id / f"{settings['name']}-{fingerprint(settings)}"
 
 
+@dataclass(eq=False)
 class FeatureStore(Mapping[str, LocalFeatures]):
     """Read access to the local features of many images, by image name (`Session.image_name`).
 
     Thread-safe. Each access reads a file.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        made_from: Mapping[str, str],
-        failed: Mapping[str, str] | None = None,
-        settings: Mapping[str, Any] | None = None,
-        items: Items | None = None,
-    ):
-        self.path = path
-        self.made_from = dict(made_from)
-        """Name of an image -> fingerprint of the sources of its features."""
-        self.failed = dict(failed or {})
-        """Name of an image that could not be read -> reason."""
-        self.settings = dict(settings or {})
-        """Settings of the extractor; empty if unknown."""
-        self._items = Items(path) if items is None else items
+    path: Path
+    made_from: Mapping[str, str]  # name of an image -> fingerprint of the sources of its features
+    failed: Mapping[str, str] = field(default_factory=dict)  # name of an image that could not be read -> reason
+    settings: Mapping[str, Any] = field(default_factory=dict)  # of the extractor; empty if unknown
+    stored: Items | None = None  # None: opened at the first access
 
     @classmethod
     def open(cls, path: str | Path) -> "FeatureStore":
@@ -82,19 +73,11 @@ class FeatureStore(Mapping[str, LocalFeatures]):
     def _of(cls, path: Path, items: Items, names: Iterable[str]) -> "FeatureStore":
         failed = {name: items.note(name)["failed"] for name in names if items.note(name)}
         made_from = {name: items.source(name) for name in names if name not in failed}
-        return cls(path, made_from, failed, items.made_by, items)
+        return cls(path, made_from, failed, items.made_by or {}, items)
 
     @classmethod
     def of_session(cls, out: str | Path, session_id: str, settings: Mapping[str, Any] | None = None) -> "FeatureStore":
-        """Open the folder with all extracted features of a session.
-
-        Args:
-            out: folder of all features.
-            settings: settings of the extractor; None: SIFT.
-
-        Raises:
-            ArtifactError: the folder is missing or has no features.
-        """
+        """Open a session's features by an extractor's settings, None: SIFT; `out` is the folder of all features."""
         return cls.open(features_path(out, session_id, settings or SiftExtractor().settings))
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -118,7 +101,8 @@ class FeatureStore(Mapping[str, LocalFeatures]):
     def __getitem__(self, name: str) -> LocalFeatures:
         if name not in self.made_from:
             raise KeyError(name)
-        arrays = self._items[name]
+        self.stored = Items(self.path) if self.stored is None else self.stored
+        arrays = self.stored[name]
         width, height, turns = arrays.pop("image").tolist()
         return LocalFeatures(**arrays, image_size=(width, height), turns=turns)
 
