@@ -34,13 +34,13 @@ Rule = tuple[Any, str, str]
 
 @dataclass(frozen=True)
 class Problem:
-    """One inconsistency."""
+    """One inconsistency: `error`, data are missing or wrong, or `warning`, data may be wrong."""
 
     session: str
     file: str  # relative to the session's folder
     line: int  # line number from 1; 0 if the problem concerns the whole file
     message: str
-    severity: str  # `error`: data are missing or wrong; `warning`: data may be wrong
+    severity: str
 
     def __str__(self) -> str:
         where = f"{self.session}/{self.file}" + (f":{self.line}" if self.line else "")
@@ -333,18 +333,17 @@ class _SessionCheck:
         span = f"{sizes.min()} to {sizes.max()}" if sizes.nunique() > 1 else f"{sizes.min()}"
         add("rigs", None if session.rigs is None else len(sizes), f"{span} sensors each" if len(sizes) else "")
         for what, trajectory in (("poses", session.trajectory), ("ground truth", session.ground_truth)):
-            note = ""
-            if what == "poses" and trajectory is not None and session.split != "map":
-                note = "odometry of the device, not used as ground truth"
-            elif what == "ground truth" and trajectory is None and session.split == "query":
-                note = f"no {ALIGNED}: these queries cannot be evaluated"
-            elif what == "ground truth" and trajectory is not None and trajectory is session.trajectory:
-                note = "from trajectories.txt"
             if trajectory is None:
-                add(what, None, note)
-            else:
-                posed = np.sum(trajectory.index.find(times, session.device_ids) >= 0)
-                add(what, len(trajectory), f"{posed:,} of {len(times):,} images have one", note)
+                lacks_truth = what == "ground truth" and session.split == "query"
+                add(what, None, f"no {ALIGNED}: these queries cannot be evaluated" if lacks_truth else "")
+                continue
+            posed = np.sum(trajectory.index.find(times, session.device_ids) >= 0)
+            note = ""
+            if what == "poses" and session.split != "map":
+                note = "odometry of the device, not used as ground truth"
+            elif what == "ground truth" and trajectory is session.trajectory:
+                note = "from trajectories.txt"
+            add(what, len(trajectory), f"{posed:,} of {len(times):,} images have one", note)
         if session.split == "map" and not self._has_errors and len(posed_photographs(session)[1]):
             add("up in the world", None, estimate_world_up([session]).reason)
         add("depth maps", None if session.depths is None else len(session.depths), missing("depths.txt"))
@@ -364,14 +363,8 @@ class _SessionCheck:
         return pd.DataFrame(rows, columns=["what", "count", "details"])
 
     def _camera_models(self) -> list[str]:
-        sensors = self.rows["sensors.txt"]
-        heads = (
-            sensors["extra"][sensors["sensor_type"] == "camera"]
-            .str.split(",", n=3)
-            .str[:3]
-            .map(lambda words: " ".join(word.strip() for word in words))
-        )
-        counts = heads.value_counts()
+        params = self.rows["sensors.txt"].query("sensor_type == 'camera'")["extra"]
+        counts = params.str.split(",", n=3).map(lambda words: " ".join(map(str.strip, words[:3]))).value_counts()
         return [*(f"{count:,} {head}" for head, count in counts.head(4).items()), "..." if len(counts) > 4 else ""]
 
 

@@ -30,8 +30,8 @@ from toolkit.geometry import Floats, Ints
 
 log = logging.getLogger(__name__)
 
+# Largest time between a photograph and the depth map of another sensor: half the period of the slowest, at 5 Hz.
 MAX_OFFSET_US = 100_000
-"""Largest time between a photograph and the depth map of another sensor: half the period of the slowest, at 5 Hz."""
 MAX_GAP_US = 1_000_000  # largest time between two poses of a sensor to interpolate between them
 _MOST_POINTS = 30_000  # per depth map; enough for a few hundred features
 _HIDDEN = 1.1  # a point deeper than its nearest neighbor by this factor is occluded, or on an edge
@@ -103,20 +103,17 @@ class DepthMaps:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._seen = lru_cache(_KEPT)(self._see)
+        self.of = lru_cache(_KEPT)(self._see)
         self._tracks: dict[str, tuple[Ints, Floats]] = {}
         self._lock = Lock()
         self._logged: set[str] = set()
 
-    def of(self, row: int) -> SeenDepth:
+    def _see(self, row: int) -> SeenDepth:
         """Return the depth in a photograph, given as a row of `Session.images`.
 
         Each depth sensor that belongs to the camera contributes its depth map nearest in time, within `MAX_OFFSET_US`.
         A depth map that cannot be read or does not fit its sensor is left out; the reason is logged once.
         """
-        return self._seen(row)
-
-    def _see(self, row: int) -> SeenDepth:
         image = self._session.images.iloc[row]
         camera = self._session.camera(str(image["sensor_id"]))
         sources, reasons = self._sources(row, int(image["timestamp"]), str(image["sensor_id"]))
@@ -128,10 +125,10 @@ class DepthMaps:
             except CaptureError as error:
                 reasons.append(str(error))
         with self._lock:
-            new = [reason for reason in reasons if reason not in self._logged]
-            self._logged.update(new)
-        for reason in new:
-            log.warning("left out: %s", reason)
+            for reason in dict.fromkeys(reasons):
+                if reason not in self._logged:
+                    log.warning("left out: %s", reason)
+            self._logged.update(reasons)
         return _visible(np.concatenate(points), camera, max(1.0, _CELL * spacing), "; ".join(reasons))
 
     @cached_property
@@ -212,8 +209,7 @@ class DepthMaps:
             return None
         share = (timestamp - times[after - 1]) / (times[after] - times[after - 1])
         rotation = Slerp([0, 1], Rotation.from_matrix(poses[after - 1 : after + 1, :3, :3]))(share).as_matrix()
-        position = (1 - share) * poses[after - 1, :3, 3] + share * poses[after, :3, 3]
-        return geometry.make_pose(rotation, position)
+        return geometry.make_pose(rotation, (1 - share) * poses[after - 1, :3, 3] + share * poses[after, :3, 3])
 
     def _points(self, source: _DepthMap, photograph: pycolmap.Camera) -> tuple[Floats, float]:
         """Return the points (P, 3) of a depth map in the photograph's camera, and their spacing in its pixels.

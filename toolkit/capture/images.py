@@ -22,11 +22,9 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 WORKERS = "TOOLKIT_WORKERS"  # environment variable with the number of threads that this process may use
-THREAD_BYTES = 1 << 29
-"""Memory to reserve for each thread, bytes: SIFT of a photograph of 4000 x 3000 pixels takes 460 MB."""
+THREAD_BYTES = 1 << 29  # memory to reserve for each thread, bytes: SIFT of 4000 x 3000 pixels takes 460 MB
 MOST_BYTES = 1 << 30  # largest size of an image file, bytes
-MOST_PIXELS = 1 << 28
-"""Largest number of pixels of a decoded image: 268 million, 0.8 GB in color. A tiny file can declare many more."""
+MOST_PIXELS = 1 << 28  # of a decoded image: 268 million, 0.8 GB in color; a tiny file can declare many more
 # JPEG and PNG bypass `PIL.Image.open`, whose limit of pixels is below the resolution of recent phones.
 _HEADER_READERS: dict[bytes, Callable[[Any], PIL.Image.Image]] = {
     b"\xff\xd8": JpegImagePlugin.JpegImageFile,

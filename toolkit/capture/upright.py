@@ -29,8 +29,8 @@ log = logging.getLogger(__name__)
 
 CLEAR = 0.15  # smallest margin of votes that decides; one image has at most 1 vote
 MAJORITY = 2 / 3  # share of the votes that decides for similar sensors, as opposed to the same sensor
+# Share of the votes needed for a decision, for each kind of name by which sensors are looked up.
 SHARES = {"sensor": 0.0, "role": MAJORITY, "name": MAJORITY, "device": MAJORITY}
-"""Share of the votes needed for a decision, for each kind of name by which sensors are looked up."""
 
 
 @dataclass(frozen=True)
@@ -92,19 +92,16 @@ class Turns:
         Args:
             rows: rows of `session.images`; None means all.
         """
-        codes, turns = self._turns_of(session)
+        key = session.path.absolute()
+        if key not in self._of_sensors:
+            self._of_sensors[key] = self._look_up(session)
+        codes, turns = self._of_sensors[key]
         selected = codes[rows if rows is None or isinstance(rows, slice) else np.atleast_1d(np.asarray(rows))]
         return turns[selected.reshape(-1)]
 
     def fingerprint(self, sessions: Sequence[Session]) -> str:
         """Return 16 hex digits that identify the turns of all images of the sessions."""
         return fingerprint([self.of(session).tolist() for session in sessions])
-
-    def _turns_of(self, session: Session) -> tuple[Ints, Ints]:
-        key = session.path.absolute()
-        if key not in self._of_sensors:
-            self._of_sensors[key] = self._look_up(session)
-        return self._of_sensors[key]
 
     def _look_up(self, session: Session) -> tuple[Ints, Ints]:
         """Return the index of each image's sensor, and the turns of each sensor; log them."""
@@ -147,10 +144,8 @@ def quarter_turns(maps: Sequence[Session], world_up: ArrayLike | None = None) ->
     names = pd.concat(tables[1:] or tables, ignore_index=True)
     up_in_cams = np.zeros((0, 3))
     if not len(names):
-        log.warning(
-            "Upright: no image of the map (%s) has a pose, so no image is turned.",
-            ", ".join(session.id for session in maps) or "no session",
-        )
+        sessions = ", ".join(session.id for session in maps) or "no session"
+        log.warning("Upright: no image of the map (%s) has a pose, so no image is turned.", sessions)
     else:
         if up is None:
             up = estimate_world_up(maps)

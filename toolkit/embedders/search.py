@@ -77,7 +77,7 @@ def search(
     k = min(k, len(vectors))
     scores, indices = np.full((len(query), k), -np.inf, np.float32), np.full((len(query), k), -1, np.int64)
     masks = allowed if isinstance(allowed, Masks) else None
-    if masks and (len(masks), masks.count) != (len(query), len(vectors)):
+    if masks is not None and (len(masks), masks.count) != (len(query), len(vectors)):
         raise ValueError(f"{len(masks)} masks of {masks.count} rows for {len(query)} queries and {len(vectors)} rows.")
     if isinstance(allowed, np.ndarray) and allowed.shape != (len(vectors),):
         raise ValueError(f"allowed has shape {allowed.shape}; expected ({len(vectors)},), one value per database row.")

@@ -46,11 +46,8 @@ _CHUNK = 8192  # number of local descriptors that are assigned at once
 _POINT_STEP, _CENTROID_STEP = 2**-11, 2**-8
 """Whitened descriptors and centroids are multiples of these. The centroids' step is coarse, so that one that moves by a
 rounding error is the same again."""
-_PROJECTION_BITS = 14
-"""Bits of an entry of the local projection, an integer, so that products with uint8 descriptors stay below 2**24."""
-_KEY_STEPS = 32
-"""Steps per unit in which a descriptor is hashed: one entry off by the last bit usually leaves the hash as it is."""
-
+_PROJECTION_BITS = 14  # of an entry of the local projection: products with uint8 descriptors stay below 2**24
+_KEY_STEPS = 32  # per unit, to hash a descriptor: one entry off by the last bit usually leaves the hash as it is
 
 _ARRAYS = ("local_projection", "local_offset", "local_scale", "centroids", "projection")  # what a vocabulary file holds
 

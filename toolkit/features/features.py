@@ -23,14 +23,11 @@ class LocalFeatures:
     """Local features of one image as it is stored, strongest response first."""
 
     keypoints: NDArray[np.float32]  # (N, 2) x y, pixels; the center of the top-left pixel is (0.5, 0.5)
-    scales: NDArray[np.float32]
-    """(N,) size of the keypoints, as standard deviation of the blob, pixels; 1 for detectors without scale."""
+    scales: NDArray[np.float32]  # (N,) sizes: standard deviation of the blob, pixels; 1 for detectors without scale
     scores: NDArray[np.float32]  # (N,) response of the detector, larger is better; comparable only within one kind
-    descriptors: Descriptors
-    """(N, D) unit vectors; or uint8, non-negative unit vectors times `DESCRIPTOR_SCALE` (RootSIFT)."""
+    descriptors: Descriptors  # (N, D) unit vectors; or uint8, such vectors >= 0 times `DESCRIPTOR_SCALE` (RootSIFT)
     image_size: tuple[int, int]  # width and height of the image, pixels
-    turns: int = 0
-    """Counter-clockwise quarter turns applied to the image before extraction. Keypoints are in the image as stored."""
+    turns: int = 0  # counter-clockwise quarter turns before extraction; keypoints are in the image as stored
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -82,18 +79,14 @@ class FeatureKind:
     """How one kind of local features is extracted and matched. Scores are cosine similarities of descriptors."""
 
     extractor: str  # `module:callable` that makes the extractor; imported when needed
-    matchers: tuple[str, ...]
-    """Keys of `toolkit.features.matching.MATCHERS` that can match queries with references, the default first."""
+    matchers: tuple[str, ...]  # keys of `matching.MATCHERS` for queries and references, the default first
     ratio: float  # Lowe's ratio of `mutual` between a query and a reference; 1: no ratio test
     min_score: float  # smallest score of a `mutual` match between a query and a reference
     epipolar_min_score: float  # smallest score of a match between map images along an epipolar line
     guided_min_score: float  # smallest score of a guided match, near the projection of a map point
-    scale_octaves: float
-    """Largest difference between the size of a keypoint and the size that the map predicts, in octaves."""
-    upright: bool = True
-    """Whether the features were learned from upright photographs, so that images are turned upright for them."""
-    shorten: Shorten | None = None
-    """Makes unit descriptors (N, D) shorter before they are compared; None: they are compared as they are."""
+    scale_octaves: float  # largest difference of a keypoint's size and the size that the map predicts, in octaves
+    upright: bool = True  # whether they were learned from upright images, so that images are turned upright for them
+    shorten: Shorten | None = None  # makes unit descriptors (N, D) shorter before they are compared; None: as they are
 
 
 KINDS: dict[str, FeatureKind] = {
@@ -144,10 +137,9 @@ def create_extractor(name: str, settings: FeaturesSettings, device: str = "auto"
         ManifestError: unknown features.
         WeightsError: the network has no weights.
     """
-    make = resolve_name(feature_kind(name).extractor)
-    own = getattr(settings, name, None)
-    checkpoint = checkpoint_of(settings.checkpoint, name)
-    extractor: Extractor = make(own) if name == "sift" else make(checkpoint, device, dtype, settings=own)
+    make, own = resolve_name(feature_kind(name).extractor), getattr(settings, name, None)
+    network = checkpoint_of(settings.checkpoint, name), device, dtype
+    extractor: Extractor = make(own) if name == "sift" else make(*network, settings=own)
     return extractor
 
 

@@ -31,8 +31,7 @@ class PairMatches:
     """K matches of the features of two images."""
 
     indices: Ints  # (K, 2) index of the first image's feature, index of the second's; no feature is matched twice
-    scores: NDArray[np.float32]
-    """(K,) cosine similarity of the descriptors, or confidence of a network; larger is better."""
+    scores: NDArray[np.float32]  # (K,) cosine similarity of descriptors, or confidence of a network; larger is better
 
     @classmethod
     def none(cls) -> "PairMatches":
@@ -157,9 +156,7 @@ class MutualMatcher:
 
     def __init__(self, ratio: float = 0.8, min_score: float = -1.0, shorten: Shorten | None = None):
         """See `FeatureKind` for the arguments."""
-        self.ratio = ratio
-        self.min_score = min_score
-        self.shorten = shorten
+        self.ratio, self.min_score, self.shorten = ratio, min_score, shorten
 
     @classmethod
     def of(cls, kind: FeatureKind) -> "MutualMatcher":
