@@ -142,6 +142,3 @@ class Capture:
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.session_ids)
-
-    def __len__(self) -> int:
-        return len(self.session_ids)

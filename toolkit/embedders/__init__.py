@@ -92,14 +92,12 @@ def create_embedder(name: str, **options: Any) -> Embedder:
     """Create an embedder.
 
     Args:
-        name: a key of `EMBEDDERS`.
+        name: a key of `EMBEDDERS`, or `auto`.
         options: arguments of the embedder: `vocabulary=<file>` for `vlad`; `checkpoint`, `device`, `dtype_compute` and
             `image_size` for `megaloc`.
 
     Raises:
         ManifestError: unknown embedder.
     """
-    if name not in EMBEDDERS:
-        raise ManifestError(f"Unknown embedder {name!r}. {nearest(name, EMBEDDERS)}")
-    embedder: Embedder = pkgutil.resolve_name(EMBEDDERS[name])(**options)
+    embedder: Embedder = pkgutil.resolve_name(EMBEDDERS[resolve_name(name)])(**options)
     return embedder
