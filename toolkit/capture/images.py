@@ -111,7 +111,7 @@ def decode(path: str | Path, flags: int, least_side: int | None = None, longest:
     try:
         with suppress(*HEADER_ERRORS[:-1]):  # OpenCV decides whether it is an image
             size = open_lazily(BytesIO(data), np.inf).size
-        if np.prod(size) > MOST_PIXELS:
+        if size[0] * size[1] > MOST_PIXELS:
             raise ValueError(f"{size[0]} x {size[1]} pixels, more than {MOST_PIXELS:,}")
         if data.startswith(b"\xff\xd8") and (least_side or longest):  # reducing saves time only for JPEG
             most = min(size) // least_side if least_side else max(size) // (longest or 1)

@@ -272,13 +272,11 @@ def times_of(table: pd.DataFrame) -> Ints:
 
 def as_strings(ids: Any) -> pa.Array:
     """Return ids (a sequence, array or Series of str) as one Arrow array."""
-    if isinstance(ids, (pd.Series, pd.api.extensions.ExtensionArray)):
-        ids = pa.array(ids)
-    elif not isinstance(ids, (pa.Array, pa.ChunkedArray)):
-        ids = pa.array(np.asarray(ids, object).ravel(), pa.large_string())
-    if isinstance(ids, pa.ChunkedArray):
-        ids = ids.combine_chunks()
-    return ids if ids.type == pa.large_string() else ids.cast(pa.large_string())
+    if not isinstance(ids, pa.Array | pa.ChunkedArray):
+        is_pandas = isinstance(ids, pd.Series | pd.api.extensions.ExtensionArray)
+        ids = pa.array(ids) if is_pandas else pa.array(np.asarray(ids, object).ravel(), pa.large_string())
+    ids = ids.combine_chunks() if isinstance(ids, pa.ChunkedArray) else ids
+    return ids.cast(pa.large_string())
 
 
 def codes_of(ids: pa.Array, vocabulary: pa.Array) -> Ints:

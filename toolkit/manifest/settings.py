@@ -224,7 +224,7 @@ class RetrieveSettings(Settings):
     """References per query image."""
     use_faiss: bool = True
     """Exact search with FAISS (true) or torch (false), with the same result. An approximate index always uses FAISS;
-    fused similarities of several descriptors always use torch."""
+    fused similarities of several descriptors, and searches with masks, always use torch."""
     faiss_gpu: bool = False
     """Run FAISS on the GPU; needs a FAISS built with GPU support."""
     normalize: bool = True
