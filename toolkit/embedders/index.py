@@ -151,17 +151,8 @@ def _open(path: Path, record: dict[str, Any], vectors: StoredVectors, settings: 
 
 
 def _is_needed(settings: RetrieveSettings, vectors: StoredVectors) -> bool:
-    if settings.index == EXACT:
-        return False
-    empty = _empty(vectors, settings.index)  # owns what `downcast_index` returns: keep it alive
-    index = faiss.downcast_index(empty)
-    least = [settings.index_candidates]
-    if isinstance(index, faiss.IndexPreTransform):
-        least.append(index.chain.at(0).d_out)
-        index = faiss.downcast_index(index.index)
-    if isinstance(index, faiss.IndexIVF):
-        least.append(index.nlist)
-    return len(vectors.rows) > max(least)
+    sizes = map(int, re.findall(r"(?:PCA|IVF)(\d+)", settings.index))  # dimensions and cells
+    return settings.index != EXACT and len(vectors.rows) > max([settings.index_candidates, *sizes])
 
 
 def _empty(vectors: StoredVectors, factory: str) -> Any:
