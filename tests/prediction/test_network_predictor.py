@@ -18,7 +18,7 @@ from tests.models.test_da3 import tiny as da3
 from tests.models.test_omega import tiny as omega
 from tests.models.test_vggt import tiny
 from toolkit.capture.images import read_image
-from toolkit.capture.turning import turn_image, turn_points, turned_from_cam
+from toolkit.capture.upright import turn_image, turn_points, turned_from_cam
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
 from toolkit.geometry import invert
 from toolkit.manifest import LocalizeSettings

@@ -224,7 +224,7 @@ class RetrieveSettings(Settings):
     """References per query image."""
     use_faiss: bool = True
     """Exact search with FAISS (true) or torch (false), with the same result. An approximate index always uses FAISS;
-    fused similarities of several descriptors always use torch."""
+    fused similarities of several descriptors, and searches with masks, always use torch."""
     faiss_gpu: bool = False
     """Run FAISS on the GPU; needs a FAISS built with GPU support."""
     normalize: bool = True
@@ -257,7 +257,7 @@ class SiftSettings(Settings):
 class SuperPointSettings(Settings):
     """SuperPoint keypoints and descriptors."""
 
-    constants = {"features/superpoint.py": "threshold nms_radius border"}
+    constants = {"features/network.py": "threshold nms_radius border"}
     max_long_side: Annotated[int, Field(ge=8)] = 1024
     """Larger images are reduced to this length of the longer side, pixels; the aspect ratio is kept."""
     max_keypoints: Positive = 2048
@@ -270,7 +270,7 @@ AlikedModel = Literal["aliked-n16", "aliked-n16rot", "aliked-n32", "aliked-t16"]
 class AlikedSettings(Settings):
     """ALIKED keypoints and descriptors."""
 
-    constants = {"features/aliked.py": "min_long_side threshold nms_radius"}
+    constants = {"features/network.py": "min_long_side threshold nms_radius"}
     model: AlikedModel = "aliked-n16"
     """Variant of the network: n16rot tolerates more in-plane rotation, n32 is larger, t16 is smaller."""
     max_long_side: Annotated[int, Field(ge=32)] = 1024

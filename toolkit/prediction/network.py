@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolkit.capture.images import default_workers, prefetch, read_image
-from toolkit.capture.turning import turn_image, turned_from_cam
+from toolkit.capture.upright import turn_image, turned_from_cam
 from toolkit.errors import ImageError, ManifestError, ToolkitError, first_line
 from toolkit.files import files_fingerprint
 from toolkit.geometry import invert, make_pose

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.capture.turning import turn_image, turn_points
+from toolkit.capture.upright import turn_image, turn_points
 from toolkit.geometry import Floats
 from toolkit.pose.base import View
 from toolkit.prediction.architectures import Layout, Size
