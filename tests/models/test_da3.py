@@ -14,8 +14,7 @@ from tests.golden.formula import cameras, photograph
 from tests.models.test_vggt import SIZES, assert_equal, fill_randomly, find_spot, picture
 from toolkit.errors import ImageError, WeightsError
 from toolkit.geometry import invert
-from toolkit.models.da3 import HEADS, DepthAnything3, cameras_from_pose_encoding, load_images
-from toolkit.models.da3.backbone import choose_reference
+from toolkit.models.da3 import HEADS, DepthAnything3, cameras_from_pose_encoding, choose_reference, load_images
 from toolkit.models.vit import places_of_view, rope_of_places
 
 H, W = 42, 56

@@ -25,10 +25,10 @@ from toolkit.manifest import LocalizeSettings
 from toolkit.models.da3 import DepthAnything3
 from toolkit.models.da3 import cameras_from_pose_encoding as da3_cameras
 from toolkit.models.da3 import load_images as load_da3_images
+from toolkit.models.multiview import Views
 from toolkit.models.omega import VGGTOmega
 from toolkit.models.omega import load_images as load_omega_images
 from toolkit.models.vggt import VGGT, cameras_from_pose_encoding, load_images
-from toolkit.models.views import Views
 from toolkit.pose.base import View
 from toolkit.prediction.architectures import ARCHITECTURES
 from toolkit.prediction.interface import Prediction

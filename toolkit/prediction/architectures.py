@@ -110,7 +110,7 @@ class VggtArchitecture(Architecture):
     _side = 518
 
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
-        from toolkit.models.vggt.preprocess import resized_size
+        from toolkit.models.vggt import resized_size
 
         portrait = any(height > width for width, height in sizes)
         # "crop" resizes a landscape photograph to the same size.
@@ -132,7 +132,7 @@ class OmegaArchitecture(Architecture):
     patch = 16
 
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
-        from toolkit.models.omega.preprocess import cropped_size, resized_size
+        from toolkit.models.omega import cropped_size, resized_size
 
         original = np.array(sizes, np.int64).reshape(-1, 2)
         cropped = np.array([cropped_size(*size) for size in sizes], np.int64).reshape(-1, 2)
@@ -157,7 +157,7 @@ class Da3Architecture(Architecture):
         self._channels = channels
 
     def lay_out(self, sizes: Sequence[Size]) -> Layout:
-        from toolkit.models.da3.preprocess import MODES, resized_sizes
+        from toolkit.models.da3 import MODES, resized_sizes
 
         resized = np.array([resized_sizes(*size)[1] for size in sizes], np.float64).reshape(-1, 2)
         width, height = resized.min(axis=0, initial=np.inf if len(sizes) else 0).tolist()
