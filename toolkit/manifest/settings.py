@@ -89,11 +89,6 @@ class Settings(BaseModel):
         except ValidationError as error:
             raise ManifestError(explain(error, cls, cls.__name__)) from None
 
-    @classmethod
-    def needed(cls) -> list[str]:
-        """Return the names of the fields without a default."""
-        return [name for name, field in cls.model_fields.items() if field.is_required()]
-
     def given(self) -> dict[str, Any]:
         """Return the explicitly set fields as plain values; fields left at their defaults are absent."""
         return self.model_dump(mode="json", exclude_unset=True)
@@ -143,8 +138,9 @@ def describe(model: type[Settings], indent: str = "") -> Iterator[str]:
         if field.is_required():
             continue
         inner, default = nested_model(field.annotation), field.get_default()
+        needed = [name for name, of_inner in (inner.model_fields if inner else {}).items() if of_inner.is_required()]
         yield from (f"{indent}# {line}".rstrip() for line in (field.description or "").splitlines())
-        if inner is not None and issubclass(inner, Settings) and not inner.needed():
+        if inner is not None and issubclass(inner, Settings) and not needed:
             off = "" if isinstance(default, Settings) else "# "
             yield f"{indent}{off}{name}:"
             yield from (f"{off}{line}" for line in describe(inner, indent + "  "))
