@@ -239,7 +239,7 @@ def test_nearest_is_the_pose_of_the_best_reference_and_labeled(small_capture: Pa
         ({"map_device": "drone"}, ToolkitError, r"drone.*ios, hl, spot"),
         ({"query_device": "drone"}, ToolkitError, r"drone.*ios, hl, spot"),
         ({"queries": "keyframes_best"}, CaptureError, "original"),
-        ({"map_device": "hl"}, ArtifactError, r"No references: .*SMALL_map_hl_query_ios\.jsonl is missing.*retrieve"),
+        ({"map_device": "hl"}, ArtifactError, r"SMALL_map_hl_query_ios\.jsonl: .*Run the retrieve stage first"),
     ],
 )
 def test_wrong_questions_are_refused(
@@ -1261,7 +1261,7 @@ def test_what_a_network_has_matched_is_kept(small_capture: Path, run: SceneFiles
     ("options", "text"),
     [
         ({"features": ["surf"]}, "Unknown local features 'surf'"),
-        ({"features": []}, "features.kinds"),
+        ({"features": []}, "features: kinds is empty"),
         ({"matcher": "lightglue"}, "suits none of the features. Known for sift: mutual"),
     ],
 )
