@@ -26,7 +26,8 @@ SIMULATED = {"name": "simulated"}
 
 def asking(capture: Path, files: SceneFiles, **of_map: Any) -> tuple[Map, StoredQueries]:
     """Open the phone's map, some of its fields replaced, for the queries of the phone."""
-    scene_map = replace(Map.open(files.run, files.scene, "ios"), **of_map)
+    h5 = files.poses_txt("ios", "ios").with_suffix(".h5")
+    scene_map = replace(Map.of_pair(h5, "ios", files.features, files.maps), **of_map)
     return scene_map, StoredQueries(Session(capture / "sessions/ios_query"), files.retrieval("ios", "ios"))
 
 

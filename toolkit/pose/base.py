@@ -15,7 +15,7 @@ from toolkit.errors import CameraError
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
 from toolkit.features.matching import AnyMethod, PairMatches
 from toolkit.geometry import Floats, Ints
-from toolkit.pose.result import QueryResult
+from toolkit.pose.result import QueryResult, Status
 
 SEARCH_DEG = (1.0, 6.0)
 """Smallest and largest radius of the search for keypoints around the projections of a prior pose, degrees."""
@@ -84,16 +84,6 @@ class Query:
     def scaled(self, factor: float) -> "Query":
         """Return the query with the baselines of its rig multiplied by a factor."""
         return replace(self, rig_from_cams=geometry.scaled(self.rig_from_cams, factor))
-
-    def part(self, images: Sequence[int]) -> "Query":
-        """Return the query restricted to some of its images."""
-        return replace(
-            self,
-            views=[self.views[index] for index in images],
-            rig_from_cams=self.rig_from_cams[list(images)],
-            features=[self.features[index] for index in images] if self.features else [],
-            network_matches=[self.network_matches[index] for index in images] if self.network_matches else [],
-        )
 
 
 @dataclass(frozen=True)
@@ -211,9 +201,22 @@ class Localizer:
         return self.solve(self.match(query, references), prediction, priors)
 
 
-def carried_over(covariance: Floats, a_from_b: Floats) -> Floats:
-    """Convert the covariance (6, 6) of a pose from motions in frame b to motions in frame a; b is mounted on a."""
-    R, (x, y, z) = a_from_b[:3, :3], a_from_b[:3, 3]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    adjoint = np.block([[R, np.zeros((3, 3))], [cross @ R, R]])
-    return np.asarray(adjoint @ covariance @ adjoint.T)
+class NearestLocalizer(Localizer):
+    """The simplest method, for comparison: the image with the best score gets the pose of its best reference."""
+
+    def __init__(self, image_names: list[str], world_from_cams: Floats) -> None:
+        """`world_from_cams` (N, 4, 4) are the poses of the N map images."""
+        self.image_names = image_names
+        self.world_from_cams = world_from_cams
+
+    def solve(self, matches: QueryMatches, prediction: None = None, priors: Sequence[Prior] = ()) -> QueryResult:
+        """Return the pose of the best reference, never `ok`; see `Localizer`."""
+        query, references = matches.query, matches.references
+        scores = [(float(best.scores[0]), camera) for camera, best in enumerate(references) if len(best.images)]
+        if not scores:
+            return QueryResult.failed("no references")
+        camera = max(scores)[1]
+        reference = int(references[camera].images[0])
+        world_from_rig = self.world_from_cams[reference] @ geometry.invert(query.rig_from_cams[camera])
+        names = (self.image_names[reference],)
+        return QueryResult(Status.LOW_CONFIDENCE, "", world_from_rig, references=names, found_by="nearest")

@@ -18,8 +18,8 @@ from toolkit.geometry import Floats, Ints
 from toolkit.manifest import PredictorSettings
 from toolkit.mapping.local_map import LocalMap
 from toolkit.models.compute import RUNNING
-from toolkit.pose.base import Localizer, Prior, Query, QueryInput, QueryMatches, References, View, carried_over
-from toolkit.pose.result import CAMERA, QueryResult, Status
+from toolkit.pose.base import Localizer, Prior, Query, QueryInput, QueryMatches, References, View
+from toolkit.pose.result import CAMERA, QueryResult, Status, carried_over
 from toolkit.prediction.interface import Prediction, Predictor
 from toolkit.prediction.references import select_references
 from toolkit.threads import fixed_sums

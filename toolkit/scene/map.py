@@ -29,16 +29,17 @@ from toolkit.mapping.pose_consistency import NOMINAL_DEPTH, USUAL_DEPTHS_M
 from toolkit.pose.base import (
     SEARCH_DEG,
     Localizer,
+    NearestLocalizer,
     Prior,
     Query,
     QueryInput,
     QueryMatches,
     References,
     RoughPose,
+    View,
 )  # fmt: skip
 from toolkit.pose.local_triangulation import OnDemandLocalizer, PosedImages
 from toolkit.pose.map_matching import MappedFeatures
-from toolkit.pose.nearest import NearestLocalizer
 from toolkit.pose.pnp import PnpLocalizer
 from toolkit.pose.result import QueryResult, Status
 from toolkit.prediction.feed_forward import FeedForwardLocalizer
@@ -120,22 +121,21 @@ class Map:
         """Extract the features of a map session and triangulate its points, or load existing ones."""
         session, mapped = capture[f"{device}_map"], list[MappedFeatures]()
         root = capture.path / "sessions"
-        map_ = cls(device, root, map_dir, settings, kinds, mapped, escalation, features_dir, predictor=predictor)
+        scene_map = cls(device, root, map_dir, settings, kinds, mapped, escalation, features_dir, predictor=predictor)
         for kind in kinds if settings.map is not None else ():
-            turns = map_.turns_of(kind, session)
+            turns = scene_map.turns_of(kind, session)
             store = extract_session(session, features_dir, kind.extractor, workers=workers, turns=turns)
             inputs = fingerprint([session_fingerprint(session), store.fingerprint])
             path = map_path(map_dir, session.id, kind.name)
             assert settings.map is not None
-            metric = settings.unit is not None
             local_map = build_map(
-                session, store, path, settings.map, settings.seed, skip_existing, inputs, workers, metric,
-                map_.refined_poses or None,
-            )
+                session, store, path, settings.map, settings.seed, skip_existing, inputs, workers,
+                settings.unit is not None, scene_map.refined_poses or None,
+            )  # fmt: skip
             mapped.append(MappedFeatures(local_map, store, KINDS[kind.name], kind.matcher, kind.name))
-        if mapped and map_.remarks:
-            log.warning("%s: %s", session.id, map_.remarks)
-        return map_
+        if scene_map.remarks:
+            log.warning("%s: %s", session.id, scene_map.remarks)
+        return scene_map
 
     @classmethod
     def open(cls, run: str | Path, scene: str, device: str) -> "Map":
@@ -217,9 +217,12 @@ class Map:
 
     def query_of_session(self, session: Session, rows: Ints) -> Query:
         """Return a query of images that one device took at one instant, given by their rows in a session."""
-        turns = None if self.turns is None else self.turns.of(session, rows).tolist()
-        images = [session.image_path(int(row)) for row in rows]
-        return query_from(images, session.cameras(rows), session.rig_from_cam(rows), turns)
+        turns = np.zeros(len(rows), np.int64) if self.turns is None else self.turns.of(session, rows)
+        views = [
+            View(session.image_name(row), session.image_path(row), camera, in_map=False, turns=turn)
+            for row, camera, turn in zip(rows.tolist(), session.cameras(rows), turns.tolist(), strict=True)
+        ]
+        return Query(views, session.rig_from_cam(rows))
 
     @fixed_sums
     def describe(self, query: Query) -> Query:
@@ -300,7 +303,9 @@ class Map:
 
     def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[Any]:
         """Return a network's prediction for each query, for `locate`; see `Localizer.predict`."""
-        return self.localizer.predict(self._in_lengths(queries), self._in_lengths(following))
+        inputs = ([(query.scaled(1 / self.length), references) for query, references in part]
+                  for part in (queries, following))  # fmt: skip
+        return self.localizer.predict(*inputs)
 
     def needs_fallback(self, query: Query, references: Sequence[References], result: QueryResult) -> bool:
         """Tell whether a result is not sure, and fallback features might find a better pose."""
@@ -340,15 +345,13 @@ class Map:
         )
 
     def _match(self, localizer: Localizer, query: Query, references: Sequence[References]) -> QueryMatches:
-        """Return the matches, in the unit that localizers assume."""
-        return localizer.match(query if self.length == 1 else query.scaled(1 / self.length), references)
+        """Return the matches, in map lengths."""
+        return localizer.match(query.scaled(1 / self.length), references)
 
     def _solve(
         self, localizer: Localizer, matches: QueryMatches, prediction: Any = None, priors: Sequence[Prior] = ()
     ) -> QueryResult:
-        """Return the pose in the unit of the map's poses."""
-        if self.length == 1:
-            return localizer.solve(matches, prediction, priors)
+        """Return the pose in the unit of the map's poses; matches and prediction are in map lengths."""
         in_lengths = [prior.scaled(1 / self.length) for prior in priors]
         return localizer.solve(matches, prediction, in_lengths).scaled(self.length)
 
@@ -368,11 +371,6 @@ class Map:
         return replace(
             result, status=Status.LOW_CONFIDENCE, reason=reason, remark=remark, focals_px=(), centers_px=()
         )
-
-    def _in_lengths(self, queries: Sequence[QueryInput]) -> Sequence[QueryInput]:
-        if self.length == 1:
-            return queries
-        return [(query.scaled(1 / self.length), references) for query, references in queries]
 
     def _prior(self, near: RoughPose, references: Sequence[References]) -> Prior:
         images = np.unique(np.concatenate([retrieved.images for retrieved in references]))
@@ -436,8 +434,9 @@ class Map:
         if not settings.predicts:
             return pnp
         predictor = self.predictor or open_predictor(settings, self.capture, self.map_dir)
-        local_map, turns = self.in_lengths[0].map, self.turns_for(settings)
-        feed_forward = FeedForwardLocalizer(local_map, self.session, predictor, settings.predictor, turns, self.length)
+        feed_forward = FeedForwardLocalizer(
+            self.in_lengths[0].map, self.session, predictor, settings.predictor, self.turns, self.length
+        )
         return feed_forward if settings.method == "feed_forward" else HybridLocalizer(pnp, feed_forward)
 
     @cached_property
@@ -479,7 +478,7 @@ class Map:
             )
         other = copy.copy(self)
         other.settings = settings
-        for name in ("localizer", "fallback", "turns", "index_of", "_world_from_cams"):
+        for name in ("localizer", "fallback", "index_of", "_world_from_cams"):
             other.__dict__.pop(name, None)
         return other
 
@@ -506,23 +505,11 @@ class Map:
         """Index of each map image in `localizer.image_names`, by its name."""
         return {name: index for index, name in enumerate(self.localizer.image_names)}
 
-    @cached_property
+    @property
     def turns(self) -> Turns | None:
         """The turns that make the capture's images upright; None if no network of the run needs upright images."""
-        if (turns := self.turns_for(self.settings)) is not None:
-            return turns
-        return self._upright if self.files is not None and self.search.shows_upright else None
-
-    def turns_for(self, settings: LocalizeSettings) -> Turns | None:
-        """Return the turns for a localizer in this map; None if it needs no upright images.
-
-        Args:
-            settings: those of the map, or others that need the same features.
-        """
-        if not needs_upright(settings, [*self.kinds, *self.escalation]):
-            return None
-        same = settings.world_up == self.settings.world_up
-        return self._upright if same else upright_turns(self.capture, settings.world_up)
+        upright = needs_upright(self.settings, [*self.kinds, *self.escalation])
+        return self._upright if upright or (self.files is not None and self.search.shows_upright) else None
 
     @cached_property
     def _upright(self) -> Turns:
@@ -603,7 +590,6 @@ def _canonical(pose: Floats) -> Floats:
     return geometry.pose_from_qt(geometry.qt_from_pose(pose))
 
 
-@fixed_sums
 def localize_image(
     scene_map: Map,
     image: Image | Sequence[Image],

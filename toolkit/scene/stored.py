@@ -1,17 +1,16 @@
 """Queries as a run stored them: images, local features, matches and references."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from toolkit.capture import Session
 from toolkit.errors import ArtifactError
 from toolkit.features.stores import FeatureStore, MatchStore, features_path
 from toolkit.files import image_name, read_references
 from toolkit.geometry import Ints
-from toolkit.pose.base import NetworkMatches, Query, QueryInput, References, View
+from toolkit.pose.base import NetworkMatches, QueryInput, References
 from toolkit.scene.map import WITHOUT_FEATURES, Map
 
 
@@ -61,28 +60,19 @@ class StoredQueries:
             scene_map: the map in which it is localized.
             rows: rows of `session.images` that one device took at one instant.
         """
-        session, turns = self.session, scene_map.turns_for(scene_map.settings)
-        images, names = session.images.iloc[rows], [session.image_name(int(row)) for row in rows]
-        keys = list(zip(images["timestamp"].tolist(), images["sensor_id"].tolist(), strict=True))
-        row_turns = np.zeros(len(rows), int) if turns is None else turns.of(session, rows)
-        views = [
-            View(name, session.image_path(int(row)), session.camera(sensor), in_map=False, turns=int(turn))
-            for row, name, (_, sensor), turn in zip(rows, names, keys, row_turns, strict=True)
-        ]
+        query, images = scene_map.query_of_session(self.session, rows), self.session.images.iloc[rows]
+        names, index_of = [view.name for view in query.views], scene_map.index_of
         stores = [] if scene_map.settings.method in WITHOUT_FEATURES else self.stores
-        query = Query(
-            views,
-            session.rig_from_cam(rows),
-            [_features(stores, name) for name in names] if stores else [],
-            [_network_matches(self.matches, name) for name in names] if any(self.matches) else [],
+        query = replace(
+            query,
+            features=[_features(stores, name) for name in names] if stores else [],
+            network_matches=[_network_matches(self.matches, name) for name in names] if any(self.matches) else [],
         )
-        return query, [self._in_map(scene_map, key) for key in keys]
-
-    def _in_map(self, scene_map: Map, key: tuple[int, str]) -> References:
-        """Return the references of an image that are in the map."""
-        index_of = scene_map.index_of
-        found = [(index_of[name], score) for name, score in self.references.get(key, []) if name in index_of]
-        return References.of([index for index, _ in found], [score for _, score in found])
+        references = []
+        for key in zip(images["timestamp"].tolist(), images["sensor_id"].tolist(), strict=True):
+            found = [(index_of[name], score) for name, score in self.references.get(key, []) if name in index_of]
+            references.append(References.of([index for index, _ in found], [score for _, score in found]))
+        return query, references
 
 
 def _features(stores: Sequence[FeatureStore], name: str) -> Any:
