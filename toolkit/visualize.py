@@ -167,7 +167,7 @@ def _pictures(out: Path, name: str) -> list[Path]:
 def _draw_pair(
     capture: Capture, pair: LocalizedPair, sequences: SequencePair | None, out: Path, settings: VisualizeSettings
 ) -> pd.DataFrame:
-    """Draw and record a pair; return its worst queries as rows of `Localizations.ranked` with their details."""
+    """Draw and record a pair; return its worst queries as rows of `LocalizedPair.table` with their details."""
     m, q = pair.map_session.device, pair.query_session.device
     shown, cloud, map_poses = pair.localizations, sure_points(pair.local_map), pair.map_session.world_from_cam()
     details_of = lru_cache(2 * WORST)(pair.details)  # the worst queries are needed for the sheet and the recording
@@ -180,7 +180,7 @@ def _draw_pair(
         unit=pair.results.unit,
     )
     save_figure(figure, out / f"{pair.name}.png", figure.get_suptitle())
-    order = shown.worst_first().tolist()
+    order = worst_first(pair.table).tolist()
     chosen = np.unique(np.linspace(0, len(order) - 1, min(settings.samples, len(order))).round().astype(int))
     for number, k in enumerate((order[rank] for rank in chosen), start=1):
         title = f"{q} query in the {m} map: {pair.results.table['status'].iloc[k]}"
@@ -199,7 +199,7 @@ def _draw_pair(
             tracks=tracks,
         )
     worst = order[:WORST]
-    rows = shown.ranked.iloc[worst]
+    rows = pair.table.iloc[worst]
     return rows.assign(unit=pair.results.unit[0], pair=f"{q} in the {m} map", details=[details_of(k) for k in worst])
 
 

@@ -625,7 +625,7 @@ def errors_deg(points: Floats, estimate: QueryResult, cameras: list[pycolmap.Cam
     matches, errors = estimate.correspondences, np.full(len(estimate.correspondences), np.inf)
     np.testing.assert_array_equal(matches.points, points[matches.point_index])
     for index, (camera, rig_from_cam) in enumerate(zip(cameras, rig_from_cams, strict=True)):
-        mine = matches.in_camera(index)
+        mine = np.flatnonzero(matches.camera == index)
         cam_from_world = geometry.invert(estimate.world_from_rig @ rig_from_cam)
         in_cam = geometry.transform(cam_from_world, matches.points[mine])
         errors_px = np.linalg.norm(np.asarray(camera.img_from_cam(in_cam)) - matches.pixels[mine], axis=1)
@@ -661,7 +661,7 @@ def test_inliers_are_what_the_pose_agrees_with_and_the_rest_is_rejected(room: Wo
     assert len(np.unique(rows, axis=0)) == len(rows)
     # Each pixel is that of a feature.
     for camera, features in enumerate(asked[2]):
-        mine = matches.pixels[matches.in_camera(camera)]
+        mine = matches.pixels[matches.camera == camera]
         assert np.isin(mine.view("f8,f8"), features.keypoints.astype(np.float64).view("f8,f8")).all()
 
 

@@ -12,7 +12,7 @@ import pytest
 from tests.localized import read_queries, some_correspondences, stored, write_queries
 from toolkit.errors import ArtifactError
 from toolkit.geometry import make_pose
-from toolkit.pose.result import Correspondences, QueryResult, Rival, Status
+from toolkit.pose.result import QueryResult, Rival, Status
 from toolkit.results.pair import PairResults
 from toolkit.store.hdf5 import CHECKSUM
 
@@ -68,13 +68,6 @@ def test_a_query_that_the_file_lacks_has_no_correspondences(path: Path, key: tup
 
 def test_maps_are_named(path: Path) -> None:
     assert PairResults(path, pd.DataFrame()).maps == ["ios_map.npz"]
-
-
-def test_correspondences_of_one_image(path: Path) -> None:
-    correspondences = read_queries(path)(17, "robot/body").correspondences
-    assert correspondences.in_camera(1).tolist() == [1, 2]
-    assert correspondences.in_camera(2).tolist() == []
-    assert len(Correspondences().in_camera(0)) == 0
 
 
 def test_a_missing_torn_or_incomplete_file_says_what_to_do(path: Path, tmp_path: Path) -> None:

@@ -117,8 +117,7 @@ class Answer:
     @property
     def true_pose(self) -> Floats | None:
         """world_from_rig (4, 4); None if unknown."""
-        queries = self.pair.localizations
-        true = queries.true[self.number] @ queries.cam_from_rig[self.number]
+        true = self.pair.true_poses[self.number]
         return true if is_posed(true) else None
 
     @property

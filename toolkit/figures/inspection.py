@@ -157,7 +157,7 @@ class InspectedPair:
             ArtifactError: no query matches, or several do (the nearest is named), or its stored results are damaged.
         """
         if query == WORST and len(self):
-            query = int(self.localized.localizations.worst_first()[0])
+            query = int(worst_first(self.localized.table)[0])
         names = self.localized.query_session.image_names
         images = {names[row]: number for number, rows in enumerate(self.localized.rows) for row in rows}
         number = find_query(query, images, len(self))
@@ -232,7 +232,7 @@ class WorstQueries:
                 with suppress(*OF_THE_DATA):  # an unfinished pair has no table, or a session broke after a good run
                     pairs.append(InspectedPair(mapped, queried, poses_dir, None, map_dir, sessions_root))
         queries = [(pair, number) for pair in pairs for number in range(len(pair))]
-        tables = [pair.localized.localizations.ranked for pair in pairs]
+        tables = [pair.localized.table for pair in pairs]
         order = worst_first(pd.concat(tables, ignore_index=True)).tolist() if queries else []
         self._queries = [queries[k] for k in order]
         self.names = [f"{pair.label}: {shown_name(pair.names[number])}" for pair, number in self._queries]

@@ -27,7 +27,7 @@ from scipy.special import fdtrc
 from toolkit import geometry
 from toolkit.alignment.robust import Bools
 from toolkit.capture.cameras import projection_jacobian
-from toolkit.geometry import Floats
+from toolkit.geometry import Floats, Ints
 from toolkit.pose.result import AGREEMENT
 from toolkit.pose.rig import Matches, RigQuery
 
@@ -38,7 +38,6 @@ MAX_SHARES = (0.1, 0.3, 0.1)
 to focal length, principal point, radial distortion. Nominal principal points are often 1 % of the focal length off."""
 SUSPICIOUS = 0.01  # largest probability of the first step (a cheap test) for which the full test runs
 CERTAIN = 1e-6  # largest probability of the first step for which intrinsics are wrong even if no others are found
-CELLS = (4, 4)  # columns and rows of an image's cells
 WIDENINGS = (8.0, 8.0, 4.0, 2.0)  # factors of the inlier limit in the first steps: wrong intrinsics enlarge errors
 STEPS = 15
 SETTLED_PX = 0.02  # largest motion of a projection in a step at which the fit has converged
@@ -72,44 +71,47 @@ class Misfit:
         """Whether a significant change moves the pose beyond `MAX_SHARES`, or the intrinsics that fit are unknown."""
         return bool(np.isnan(self.parameters).any() or (self.shares > MAX_SHARES).any())
 
-    def _at_fault(self, kind: int) -> Bools:
-        """Tell for each camera whether focal length (0), principal point (1) or distortion (2) misfits the most."""
+    @property
+    def _at_fault(self) -> Ints:
+        """(C,) what misfits most: focal length (0), principal point (1), distortion (2) or nothing (-1)."""
         excess = self.shares / MAX_SHARES
-        return (excess[:, kind] > 0) & (excess.argmax(axis=1) == kind)
+        return np.where(excess.any(axis=1), excess.argmax(axis=1), -1)
 
     def focals_px(self, cameras: list[pycolmap.Camera]) -> tuple[float, ...]:
         """Return the focal length that fits each camera; NaN if something else or nothing misfits."""
-        stated = np.array([camera.mean_focal_length() for camera in cameras])
-        return tuple(np.where(self._at_fault(0), stated * (1 + self.parameters[:, 0]), np.nan).tolist())
+        return tuple(np.where(self._at_fault == 0, self._fitted(cameras)[:, 0], np.nan).tolist())
 
     def centers_px(self, cameras: list[pycolmap.Camera]) -> tuple[tuple[float, float], ...]:
         """Return the principal point that fits each camera; NaN if something else or nothing misfits."""
-        stated = [(one.principal_point_x, one.principal_point_y, one.mean_focal_length()) for one in cameras]
-        fitted = [
-            (x + focal_px * right, y + focal_px * down)
-            for (x, y, focal_px), (_, right, down, _) in zip(stated, self.parameters.tolist(), strict=True)
-        ]
-        unknown = (float("nan"),) * 2
-        return tuple(xy if fault else unknown for xy, fault in zip(fitted, self._at_fault(1), strict=True))
+        centers = np.where(self._at_fault[:, None] == 1, self._fitted(cameras)[:, 1:], np.nan)
+        return tuple((x, y) for x, y in centers.tolist())
+
+    def _fitted(self, cameras: list[pycolmap.Camera]) -> Floats:
+        """Return focal length and principal point x, y that fit each camera, (C, 3), pixels."""
+        stated = _stated(cameras)
+        focal, *center = self.parameters[:, :3].T
+        return np.column_stack([stated[:, 0] * (1 + focal), stated[:, 1:] + stated[:, :1] * np.transpose(center)])
 
     def reason(self, cameras: list[pycolmap.Camera]) -> str:
         """Return a text that compares, for each camera that misfits, the fitted and the stated value."""
         if np.isnan(self.parameters).any():
             return "the matches contradict the intrinsics, and no others were found that fit: check model and numbers"
-        texts = []
-        for number, (camera, change, shares) in enumerate(zip(cameras, self.parameters, self.shares, strict=True)):
-            if not shares.any():
-                continue
-            stated_px, (x, y) = camera.mean_focal_length(), (camera.principal_point_x, camera.principal_point_y)
-            fitted_px, right_px, down_px = stated_px * (np.array([1, 0, 0]) + change[:3])
+        texts, stated, fitted = [], _stated(cameras), self._fitted(cameras)
+        for number in np.flatnonzero(self._at_fault >= 0):
+            (focal_px, x, y), (fitted_px, fitted_x, fitted_y) = stated[number], fitted[number]
+            corners = 100 * self.parameters[number, 3]
             text = (
-                f"the focal length that fits is {fitted_px:.1f} px, its intrinsics say {stated_px:.1f} px",
-                f"the principal point that fits is {x + right_px:.1f}, {y + down_px:.1f}, its intrinsics say "
-                f"{x:.1f}, {y:.1f}",
-                f"the radial distortion that fits moves the corners by {100 * change[3]:+.1f} % against its intrinsics",
-            )[int(np.argmax(shares / MAX_SHARES))]
+                f"the focal length that fits is {fitted_px:.1f} px, its intrinsics say {focal_px:.1f} px",
+                f"the principal point that fits is {fitted_x:.1f}, {fitted_y:.1f}, its intrinsics say {x:.1f}, {y:.1f}",
+                f"the radial distortion that fits moves the corners by {corners:+.1f} % against its intrinsics",
+            )[self._at_fault[number]]
             texts.append(f"camera {number + 1} of {len(cameras)}: {text}" if len(cameras) > 1 else text)
         return "; ".join(texts)
+
+
+def _stated(cameras: list[pycolmap.Camera]) -> Floats:
+    """Return mean focal length and principal point x, y of cameras, (C, 3), pixels."""
+    return np.array([(one.mean_focal_length(), one.principal_point_x, one.principal_point_y) for one in cameras])
 
 
 def find_misfit(
@@ -177,12 +179,7 @@ def _try_cameras(stated: "_Problem", start: "_Estimate", inliers: int) -> Misfit
         fitted = problem.fit(_Estimate(pose, np.zeros(problem.unknowns - 6)), ~np.zeros(problem.unknowns, bool))
         if fitted is not None and problem.inliers(fitted).sum() > best:
             best = float(problem.inliers(fitted).sum())
-            changes = np.array([
-                _change(camera, other, parameters)
-                for camera, other, parameters in zip(
-                    stated.query.cameras, cameras, fitted.parameters.reshape(-1, 4), strict=True
-                )
-            ])  # fmt: skip
+            changes = np.array(list(map(_change, stated.query.cameras, cameras, fitted.parameters.reshape(-1, 4))))
             # If it is nearly the stated camera, the fit will tell.
             sizes = _sizes(changes)
             largest = np.where(sizes == sizes.max(axis=1, keepdims=True), 1.0, 0.0)
@@ -199,9 +196,8 @@ def _simple(camera: pycolmap.Camera, share: float) -> pycolmap.Camera:
 
 def _change(stated: pycolmap.Camera, other: pycolmap.Camera, parameters: Floats) -> Floats:
     """Return the `Misfit.parameters` (4,) from stated intrinsics to those at a change (4,) of another camera."""
-    focal_px, other_px = stated.mean_focal_length(), other.mean_focal_length()
-    center = np.array([stated.principal_point_x, stated.principal_point_y])
-    other_center = (other.principal_point_x, other.principal_point_y) + other_px * parameters[1:3]
+    (focal_px, *center), (other_px, *other_center) = _stated([stated, other])
+    center, other_center = np.array(center), other_center + other_px * parameters[1:3]
     corner = np.hypot(stated.width, stated.height) / 2 / focal_px
     seen = np.asarray(stated.img_from_cam(np.array([[corner, 0.0, 1.0]]))).ravel()
     distortion = float(np.nan_to_num(np.linalg.norm(seen - center) / (corner * focal_px) - 1, nan=-1.0))
@@ -332,12 +328,6 @@ class _Problem:
         """Tell which matches (K,) are inliers."""
         return np.linalg.norm(self.linearize(estimate)[0], axis=1) < self._limits_px
 
-    def _cells(self, chosen: Bools) -> int:
-        """Return the number of cells, of all images, with one of the chosen matches."""
-        sizes = np.array([(camera.width, camera.height) for camera in self.query.cameras])[self.matches.camera[chosen]]
-        cells = np.clip(np.array(CELLS) * self.matches.pixels[chosen] / sizes, 0, np.array(CELLS) - 1).astype(np.int64)
-        return len(np.unique(np.column_stack([self.matches.camera[chosen], cells]), axis=0))
-
     def misfit(self, start: _Estimate, fitted: _Estimate, free: Bools, noise_px: float) -> Misfit | None:
         """Return what fitted intrinsics say of the stated ones; None if noise alone may explain the difference.
 
@@ -350,7 +340,7 @@ class _Problem:
         residuals, jacobian = self.linearize(fitted)
         errors = np.linalg.norm(residuals, axis=1)
         inliers = errors < self._limits_px
-        observations, cameras = self._cells(inliers), len(self.query.cameras)
+        observations, cameras = self.query.num_cells(self.matches[inliers]), len(self.query.cameras)
         freedom = 2 * observations - int(free.sum())
         if freedom < 1:
             return None

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from threading import Lock
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,12 +135,7 @@ class MappedFeatures:
         return points
 
     def candidates(
-        self,
-        query: RigQuery,
-        kind: int,
-        rig_from_world: Floats,
-        references: Sequence[int],
-        radius_deg: float,
+        self, query: RigQuery, kind: int, rig_from_world: Floats, references: Sequence[int], radius_deg: float
     ) -> Iterator["Candidates"]:
         """Yield, for each query image, candidate matches of its keypoints with map points that project near them.
 
@@ -211,8 +207,7 @@ def _similarities(
     return scores
 
 
-@dataclass(frozen=True)
-class Candidates:
+class Candidates(NamedTuple):
     """K candidate matches of a query image and one kind of features, highest score first.
 
     A keypoint or a point may be in several of them.
@@ -221,10 +216,6 @@ class Candidates:
     matches: Matches
     keypoint: Ints
     """(K,) index of the keypoint in the query image."""
-
-    def mutual(self, chosen: Ints) -> Ints:
-        """Return the mutual best matches among some candidates, given by ascending index."""
-        return chosen[_is_first(self.keypoint[chosen]) & _is_first(self.matches.point[chosen])]
 
 
 def _is_first(numbers: Ints) -> NDArray[np.bool_]:
@@ -278,8 +269,9 @@ class Vicinity:
         """
         chosen = []
         for projected, which, group in zip(self._project(rig_from_world), self._which, self._candidates, strict=True):
-            near = self._near(projected[which], group.matches.pixels, group.matches, radius_deg)
-            chosen.append(group.matches[group.mutual(np.flatnonzero(near))[:limit]])
+            near = np.flatnonzero(self._near(projected[which], group.matches.pixels, group.matches, radius_deg))
+            mutual = near[_is_first(group.keypoint[near]) & _is_first(group.matches.point[near])]
+            chosen.append(group.matches[mutual[:limit]])
         return Matches.pooled(chosen)
 
     def _project(self, rig_from_world: Floats) -> list[Floats]:
@@ -340,9 +332,11 @@ class MapMatcher:
     def vicinity(self, query: RigQuery, rig_from_world: Floats, images: Ints, radius_deg: float) -> Vicinity:
         """Return the candidate matches around a pose with the points of map images."""
         candidates = [
-            replace(group, matches=replace(group.matches, point=group.matches.point + int(self._first_point[kind])))
+            Candidates(replace(matches, point=matches.point + int(self._first_point[kind])), keypoint)
             for kind, features in enumerate(self.mapped)
-            for group in features.candidates(query, kind, rig_from_world, self._of_kind(kind, images), radius_deg)
+            for matches, keypoint in features.candidates(
+                query, kind, rig_from_world, self._of_kind(kind, images), radius_deg
+            )
         ]
         return Vicinity(query, candidates, self.map.points, rig_from_world, radius_deg)
 
@@ -354,8 +348,10 @@ class MapMatcher:
 
     def kind_names(self, points: Ints) -> NDArray[np.str_]:
         """Return the name of the kind of features of each point."""
-        names = np.array([features.name for features in self.mapped])
-        return names[np.searchsorted(self._first_point, points, side="right") - 1]
+        return np.array([features.name for features in self.mapped])[self._kind_of(points)]
+
+    def _kind_of(self, points: Ints) -> Ints:
+        return np.searchsorted(self._first_point, points, side="right") - 1
 
     def keypoints(self, image: int, points: Ints) -> tuple[Ints, Floats]:
         """Return which points a map image observes, as indices (n,) into `points`, and its keypoints (n, 2), pixels."""
@@ -364,7 +360,7 @@ class MapMatcher:
         at = np.flatnonzero(np.isin(points, seen))  # `points` may repeat a point that several cameras of a rig see
         observation = first[np.searchsorted(seen, points[at])]
         pixels = np.zeros((len(at), 2))
-        kinds = np.searchsorted(self._first_point, points[at], side="right") - 1
+        kinds = self._kind_of(points[at])
         for kind in np.unique(kinds):
             seen_by = self.mapped[kind].image(self._of_kind(int(kind), [image])[0])
             pixels[kinds == kind] = seen_by.keypoints[keypoint[observation[kinds == kind]]]

@@ -25,7 +25,7 @@ from toolkit.pose.confidence import EVIDENCE, bounded_by_deviation, bounded_by_r
 from toolkit.pose.intrinsics_check import find_misfit
 from toolkit.pose.map_matching import MapMatcher, MappedFeatures, MatchCache, Vicinity
 from toolkit.pose.result import CAMERA, Correspondences, QueryResult, Rival, Status, agree
-from toolkit.pose.rig import Matches, RigQuery, least_squares_covariance
+from toolkit.pose.rig import CELLS, Matches, RigQuery, least_squares_covariance
 from toolkit.threads import fixed_sums
 
 PNP_FORMAT = 5
@@ -101,10 +101,6 @@ class PnpMatches(QueryMatches):
             [features for features in self.query.features if not isinstance(features, str)],
         )
 
-    @cached_property
-    def references_of_usable(self) -> list[References]:
-        return [self.references[index] for index in self.usable]
-
     def with_references(self, references: Sequence[References]) -> Matches:
         """Return the matches of each usable image with some of its references."""
         stored = [self.query.network_matches[index] for index in self.usable] if self.query.network_matches else []
@@ -147,7 +143,7 @@ class PnpLocalizer(Localizer):
         missing = "; ".join(features for features in matches.query.features if isinstance(features, str))
         if not matches.usable:
             return QueryResult.failed(f"no readable image ({missing})")
-        references = matches.references_of_usable
+        references = [matches.references[index] for index in matches.usable]
         if not any(len(retrieved.images) for retrieved in references):
             return QueryResult.failed("no references", remark=missing)
         rig = matches.rig
@@ -389,7 +385,7 @@ class PnpLocalizer(Localizer):
             rmse_px=float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan"),
             rival_support=rivals[0].support if rivals else 0.0,
             rivals=tuple(rivals),
-            coverage=self._coverage(query, inliers),
+            coverage=query.num_cells(inliers) / (CELLS**2 * len(query.cameras)),
             agreement=self._agreement(inliers),
             references=tuple(self.image_names[image] for image in used),
             correspondences=self._correspondences(all_matches, agreeing, len(guided), used),
@@ -405,12 +401,6 @@ class PnpLocalizer(Localizer):
         """Return the number of inlier points of the kind of features that has the second most."""
         counts = np.unique(self.matcher.kind_names(np.unique(inliers.point)), return_counts=True)[1]
         return int(np.sort(counts)[-2]) if len(counts) > 1 else 0
-
-    def _coverage(self, query: RigQuery, inliers: Matches) -> float:
-        """Return the share of cells with an inlier, in a 4 x 4 grid over each query image."""
-        sizes = np.array([(camera.width, camera.height) for camera in query.cameras])
-        cells = np.clip(4 * inliers.pixels / sizes[inliers.camera], 0, 3).astype(np.int64)
-        return len(np.unique(np.column_stack([inliers.camera, cells]), axis=0)) / (16 * len(sizes))
 
     def _correspondences(
         self, matches: Matches, inlier: NDArray[np.bool_], guided: int, references: Sequence[int]

@@ -17,7 +17,6 @@ CAMERA = "camera?"
 """Reason of a pose whose matches contradict the intrinsics of the query."""
 AGREEMENT = (5.0, 0.5)  # degrees, meters: two poses within both confirm each other
 _NAMES = ("images", "references", "rejected")
-_RIVALS = ("rivals", "rival_supports")
 
 
 class Status(StrEnum):
@@ -85,18 +84,19 @@ class Correspondences:
     def __len__(self) -> int:
         return len(self.camera)
 
-    def in_camera(self, camera: int) -> Ints:
-        """Return the indices of the correspondences of one query image."""
-        return np.flatnonzero(self.camera == camera)
 
-
-_ARRAYS = tuple(Correspondences.__dataclass_fields__)
-
-
-def _shape_of(name: str, correspondences: Correspondences) -> tuple[int, ...]:
-    count = len(correspondences.view_of) if name.startswith("view_") else len(correspondences.camera)
-    width = {"pixels": 2, "points": 3, "view_pixels": 2}.get(name)
-    return (count,) if width is None else (count, width)
+_STORED: dict[str, tuple[type[np.generic], tuple[int, ...]]] = {
+    "camera": (np.int32, ()),
+    "pixels": (np.float32, (2,)),
+    "points": (np.float64, (3,)),
+    "point_index": (np.int32, ()),
+    "inlier": (np.bool_, ()),
+    "view_of": (np.int32, ()),
+    "view_reference": (np.int32, ()),
+    "view_pixels": (np.float32, (2,)),
+}
+"""Types of the arrays of `Correspondences` in a file, and shapes of their entries. float32 makes the file smaller and
+keeps pixels of any image exact to a hundredth."""
 
 
 @dataclass(frozen=True)
@@ -239,19 +239,16 @@ class QueryResult:
 
     def arrays(self) -> dict[str, Any]:
         """Return pose, correspondences, rivals and names as arrays by name; texts as objects; see `from_arrays`."""
-        arrays = dict(vars(self.correspondences))
-        labels, codes = np.unique(arrays.pop("found_by"), return_inverse=True)
-        names = {name: np.array(getattr(self, name), object) for name in _NAMES}
-        # float32 makes the file smaller and keeps pixels of any image exact to a hundredth.
-        arrays |= {key: arrays[key].astype(np.float32) for key in ("pixels", "view_pixels")}
-        arrays |= {key: arrays[key].astype(np.int32) for key in ("camera", "point_index", "view_of", "view_reference")}
+        found = self.correspondences
+        arrays: dict[str, Any] = {key: getattr(found, key).astype(dtype) for key, (dtype, _) in _STORED.items()}
+        labels, codes = np.unique(found.found_by, return_inverse=True)
         arrays |= {"found_by": codes.astype(np.uint8), "found_by_labels": labels.astype(object)}
         arrays["world_from_rig"] = np.full((4, 4), np.nan) if self.world_from_rig is None else self.world_from_rig
         arrays["covariance"] = np.full((6, 6), np.nan) if self.covariance is None else self.covariance
         arrays["misfit"] = np.array(self.misfit)
         arrays["rivals"] = np.array([rival.world_from_rig for rival in self.rivals]).reshape(-1, 4, 4)
         arrays["rival_supports"] = np.array([rival.support for rival in self.rivals], np.float64)
-        return arrays | names
+        return arrays | {name: np.array(getattr(self, name), object) for name in _NAMES}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Any]) -> Self:
@@ -260,29 +257,24 @@ class QueryResult:
         Raises:
             ValueError, KeyError: an array has another shape or is missing.
         """
-        stored = dict(arrays)
-        labels = np.array([_text(label) for label in stored.pop("found_by_labels")], np.str_)
-        codes = stored.pop("found_by").astype(np.int64)
-        images, references, rejected = (tuple(_text(text) for text in stored.pop(key)) for key in _NAMES)
-        poses, supports = (stored.pop(key) for key in _RIVALS)
-        rivals = tuple(map(Rival, poses.reshape(-1, 4, 4), supports.tolist()))
         wide = {"f": np.float64, "i": np.int64, "b": np.bool_}
-        found_by = labels[codes] if len(labels) else np.zeros(0, "U1")
-        arrays = {key: stored[key].astype(wide[stored[key].dtype.kind]) for key in _ARRAYS if key != "found_by"}
-        read = Correspondences(**arrays, found_by=found_by)
-        if wrong := [name for name in _ARRAYS if getattr(read, name).shape != _shape_of(name, read)]:
-            raise ValueError(f"{wrong[0]} has the shape {getattr(read, wrong[0]).shape}")
-        pose, covariance = stored["world_from_rig"], stored["covariance"]
+        labels = np.array([_text(label) for label in arrays["found_by_labels"]], np.str_)
+        found_by = labels[arrays["found_by"].astype(np.int64)] if len(labels) else np.zeros(0, "U1")
+        read = {key: arrays[key].astype(wide[arrays[key].dtype.kind]) for key in _STORED}
+        for key, array in (read | {"found_by": found_by}).items():
+            count = len(read["view_of" if key.startswith("view_") else "camera"])
+            if array.shape != (count, *(_STORED[key][1] if key in _STORED else ())):
+                raise ValueError(f"{key} has the shape {array.shape}")
+        pose, covariance = arrays["world_from_rig"], arrays["covariance"]
+        names = {name: tuple(_text(text) for text in arrays[name]) for name in _NAMES}
         return cls(
             Status.FAILED,
             world_from_rig=None if np.isnan(pose).all() else pose,
             covariance=None if np.isnan(covariance).all() else covariance,
-            images=images,
-            references=references,
-            rejected=rejected,
-            correspondences=read,
-            rivals=rivals,
-            misfit=bool(stored["misfit"]),
+            **names,
+            correspondences=Correspondences(**read, found_by=found_by),
+            rivals=tuple(map(Rival, arrays["rivals"].reshape(-1, 4, 4), arrays["rival_supports"].tolist())),
+            misfit=bool(arrays["misfit"]),
         )
 
 

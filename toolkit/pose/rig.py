@@ -28,10 +28,12 @@ LOSS_SHARE = 0.6
 """Scale from a close pose, as a share of the median error. Errors of points and keypoints have heavy tails: with 1 px,
 the position errors of the captures in docs/results.md are 4 % larger. With a smaller share, poses are clearly worse
 where errors are Gaussian, and the covariance, which is that of plain least squares, is too small for them."""
-LEAST_LOSS_PX = 0.05
+MIN_LOSS_PX = 0.05
 """Smallest scale, pixels: exact matches have no error."""
 STEP = 1e-6
 """Length of the step, meters and radians, after which a refinement ends."""
+CELLS = 4
+"""Columns and rows of the cells of an image."""
 POSELIB_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
 """COLMAP's names of the camera models that PoseLib 2.0.5 can refine with. With others it returns the pose unchanged."""
 
@@ -97,6 +99,12 @@ class RigQuery:
         if (camera, kind) not in self._unit:
             self._unit[camera, kind] = unit_descriptors(self.features[camera][kind].descriptors, shorten)
         return self._unit[camera, kind]
+
+    def num_cells(self, matches: Matches) -> int:
+        """Return the number of cells, of all images, with a match."""
+        sizes = np.array([(camera.width, camera.height) for camera in self.cameras])
+        cells = np.clip(CELLS * matches.pixels / sizes[matches.camera], 0, CELLS - 1).astype(np.int64)
+        return len(np.unique(np.column_stack([matches.camera, cells]), axis=0))
 
     def pixels(self, camera: Ints, keypoint: Ints, kind: int) -> Floats:
         """Return the pixels (K, 2) of keypoints of one kind, given by camera (K,) and index (K,)."""
@@ -204,7 +212,7 @@ class RigQuery:
         if close and len(matches) > 6 and all(camera.model.name in POSELIB_MODELS for camera in self.cameras):
             median_px = np.median(self.errors_px(rig_from_world, matches, points))
             # A pose fits few matches too well (Rousseeuw and Leroy 1987, "Robust Regression", section 5.1).
-            scale_px = float(np.clip(LOSS_SHARE * (1 + 5 / (len(matches) - 6)) * median_px, LEAST_LOSS_PX, LOSS_PX))
+            scale_px = float(np.clip(LOSS_SHARE * (1 + 5 / (len(matches) - 6)) * median_px, MIN_LOSS_PX, LOSS_PX))
         origin = geometry.local_origin(points[matches.point])
         pixels, xyz, cameras = self._by_camera(matches, points, origin, undistort=False)
         options = {"loss_type": "CAUCHY", "loss_scale": scale_px, "step_tol": STEP}
@@ -229,9 +237,8 @@ class RigQuery:
 
     def errors_px(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
         """Return the reprojection errors (K,) of matches with points (P, 3), pixels; inf behind a camera."""
-        return np.asarray(
-            np.linalg.norm(self.projected(rig_from_world, matches, points) - matches.pixels, axis=1), np.float64
-        )
+        errors = self.projected(rig_from_world, matches, points) - matches.pixels
+        return np.asarray(np.linalg.norm(errors, axis=1), np.float64)
 
     def errors_deg(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
         """Return the reprojection errors (K,) as angles."""

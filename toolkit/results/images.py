@@ -15,7 +15,7 @@ from toolkit.capture import Capture, Session
 from toolkit.geometry import Floats, Ints, invert
 from toolkit.mapping.local_map import LocalMap
 from toolkit.pose.result import Correspondences, QueryResult
-from toolkit.results.metrics import is_posed, pose_errors, worst_first
+from toolkit.results.metrics import is_posed
 from toolkit.results.pair import PairResults
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ class Localizations:
 
     names: Sequence[str]
     table: pd.DataFrame
-    """The pair's csv, with at least the columns status and num_inliers."""
+    """`PairResults.errors`: the pair's csv with the errors of the device."""
     estimated: Floats
     """world_from_cam (Q, 4, 4), NaN without a pose."""
     true: Floats
@@ -143,8 +143,6 @@ class Localizations:
     """World position (Q, 3) of the first reference of each query without a pose; else NaN."""
     unit: tuple[str, float] = ("m", 1.0)
     """Unit that lengths are shown in, see `metrics.length_unit`."""
-    cam_from_rig: Floats = field(default_factory=lambda: np.eye(4))
-    """(Q, 4, 4), or one (4, 4) for all."""
 
     def shifted(self, offset: Floats) -> "Localizations":
         """Return the queries in a world whose origin is shifted, see `ShownImage.shifted`."""
@@ -154,21 +152,6 @@ class Localizations:
             true=geometry.shifted(self.true, offset),
             nearest_reference=self.nearest_reference + offset,
         )
-
-    @cached_property
-    def ranked(self) -> pd.DataFrame:
-        """The table with the errors of the device: `rotation_error_deg`, and `translation_error_m`.
-
-        They equal those of the evaluation: infinite without a pose, NaN without ground truth. Lengths are in `unit`.
-        """
-        rotation_deg, translation = pose_errors(self.estimated @ self.cam_from_rig, self.true @ self.cam_from_rig)
-        table = self.table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation)
-        lengths = table.columns.intersection(["translation_error_m", "position_std_m"])
-        return table.assign(**table[lengths] / self.unit[1])
-
-    def worst_first(self) -> Ints:
-        """Return the rows from worst to best (`metrics.worst_first`)."""
-        return worst_first(self.ranked)
 
 
 @dataclass
@@ -207,33 +190,41 @@ class LocalizedPair:
         return self.results.path.stem
 
     @cached_property
+    def true_poses(self) -> Floats:
+        """world_from_rig (Q, 4, 4); NaN where unknown."""
+        first = [rows[0] for rows in self.rows]
+        true = self.query_session.world_from_cam(first, ground_truth=True)
+        return np.asarray(true @ invert(self.query_session.rig_from_cam(first)))
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """The pair's csv with the errors, see `PairResults.errors`."""
+        return self.results.errors(self.true_poses)
+
+    @cached_property
     def localizations(self) -> Localizations:
-        session = self.query_session
-        first = np.array([rows[0] for rows in self.rows], np.int64)
-        rig_from_cam = session.rig_from_cam(first)
-        estimated = self.results.poses @ rig_from_cam
+        session, first = self.query_session, [int(rows[0]) for rows in self.rows]
+        estimated = self.results.poses @ session.rig_from_cam(first)
         centers = np.full((len(first), 3), np.nan)
         for k in np.flatnonzero(~is_posed(estimated)):
             names = [name for name in self.results[int(k)].references if name in self.map_session.row_of_name]
             if names:
                 centers[k] = self.map_session.world_from_cam([self.map_session.row_of_name[names[0]]])[0, :3, 3]
-        names = [session.image_name(int(row)) for row in first]
+        names = [session.image_name(row) for row in first]
         true = session.world_from_cam(first, ground_truth=True)
-        of_results = self.results.table, estimated, true, centers, self.results.unit
-        return Localizations(names, *of_results, invert(rig_from_cam))
+        return Localizations(names, self.table, estimated, true, centers, self.results.unit)
 
     def details(self, k: int, result: QueryResult | None = None) -> QueryDetails:
         """Return images, correspondences and references of query k, as stored or of another result."""
         session, rows = self.query_session, self.rows[k]
         query = self.results[k] if result is None else result
         pose = np.full((4, 4), np.nan) if query.world_from_rig is None else query.world_from_rig
-        poses = pose @ session.rig_from_cam(rows)
-        cameras = []
-        for row, pose in zip(rows.tolist(), poses, strict=True):
+        found, cameras = query.correspondences, []
+        for row, world_from_cam in zip(rows.tolist(), pose @ session.rig_from_cam(rows), strict=True):
             name = session.image_name(row)
-            matches = query.correspondences.in_camera(query.images.index(name) if name in query.images else -1)
-            pixels = query.correspondences.pixels[matches]
-            cameras.append(_shown_image(session, row, pose, query.correspondences, matches, pixels))
+            number = query.images.index(name) if name in query.images else -1
+            matches = np.flatnonzero(found.camera == number)
+            cameras.append(_shown_image(session, row, world_from_cam, found, matches, found.pixels[matches]))
         cameras.sort(key=lambda camera: -camera.num_inliers)
         return QueryDetails(
             cameras,
@@ -260,7 +251,7 @@ def _shown_image(
     return ShownImage(
         session.image_name(row),
         session.image_path(row),
-        session.camera(str(session.images["sensor_id"].iloc[row])),
+        session.cameras([row])[0],
         pose,
         pixels,
         correspondences.points[matches],

@@ -133,7 +133,7 @@ def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
     import rerun as rr
 
     located, has_truth = is_posed(queries.estimated), is_posed(queries.true)
-    colors = error_colors(queries.ranked["translation_error_m"])
+    colors = error_colors(queries.table["translation_error_m"])
     labels = np.array([f"#{k} {describe(queries, k)}" for k in range(len(queries.names))], object)
 
     def dots(path: str, rows: NDArray[np.bool_], centers: Floats, color: Any, radius: float) -> None:
@@ -251,7 +251,7 @@ def _jpeg_of(path: Path) -> tuple[bytes, tuple[int, int]]:
 
 def describe(queries: Localizations, k: int) -> str:
     """Return one line of text about a query: name, status, errors, inliers."""
-    row = queries.ranked.iloc[k]
+    row = queries.table.iloc[k]
     parts = [str(queries.names[k]), str(row["status"])]
     if np.isfinite(row["translation_error_m"]):
         parts.append(f"off by {row['rotation_error_deg']:.2g}°, {row['translation_error_m']:.3g} {queries.unit[0]}")
