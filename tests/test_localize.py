@@ -778,7 +778,7 @@ def test_a_picture_is_turned_for_what_the_run_turned_images_for(
     place = Map.open(files.run, files.scene, "ios")
     place.settings = LocalizeSettings.of({"method": "feed_forward"})
     place.search.embed_settings = EmbedSettings.of({"upright": upright})  # type: ignore[misc]
-    learned = Learned(np.ones(place.search._descriptors[0].shape[1], np.float32))
+    learned = Learned(np.ones(place.search._descriptors.shape[1], np.float32))
     place.search.embedders = [learned]  # type: ignore[misc]
     asked: list[Query] = []
     localizer = AsManyAsFeatures(place.mapped)

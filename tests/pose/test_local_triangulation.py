@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tests.queries import indices_of, query_of
 from toolkit import geometry
-from toolkit.features.features import LocalFeatures
+from toolkit.features.features import KINDS, LocalFeatures
 from toolkit.features.matching import LocalMethod, Matcher, MutualMatcher, PairMatches
 from toolkit.mapping.local_map import LocalMap
 from toolkit.pose.base import References
@@ -100,7 +100,7 @@ class Scene:
             obs_point=np.tile(np.arange(far, count), len(names)),
             noise_px=np.full(count, 0.3, np.float32),
         )
-        return MappedFeatures(whole, self.features, matcher=ByPoint(), name=name)
+        return MappedFeatures(whole, self.features, name, ByPoint(), KINDS["sift"])
 
     def localizer(
         self,

@@ -746,7 +746,7 @@ SINGLE_SCALE = replace(KINDS["sift"], scale_octaves=float("inf"), shorten=None)
 def test_several_kinds_of_features_give_one_pose_with_the_matches_of_all(room: World) -> None:
     other = other_kind(room, 5)
     kinds = [MappedFeatures(room.local_map, room.features),
-             MappedFeatures(other.local_map, other.features, SINGLE_SCALE, name="other")]  # fmt: skip
+             MappedFeatures(other.local_map, other.features, "other", kind=SINGLE_SCALE)]  # fmt: skip
     seen = [room.look(PINHOLE, QUERY, limit=45), other.look(PINHOLE, QUERY, limit=45)]  # all references are matched
     alone = [
         ask(PnpLocalizer([kind]), [PINHOLE], np.eye(4)[None], [one], [REFERENCES])
@@ -782,7 +782,7 @@ def test_several_kinds_of_features_give_one_pose_with_the_matches_of_all(room: W
 def test_one_kind_that_sees_nothing_leaves_the_answer_of_the_other(room: World) -> None:
     other = other_kind(room, 5)
     kinds = [MappedFeatures(room.local_map, room.features),
-             MappedFeatures(other.local_map, other.features, SINGLE_SCALE)]  # fmt: skip
+             MappedFeatures(other.local_map, other.features, kind=SINGLE_SCALE)]  # fmt: skip
     seen = room.look(PINHOLE, QUERY)
     nothing = other.look(PINHOLE, QUERY, limit=0)
     expected = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])

@@ -73,16 +73,11 @@ def terms(evidence: Mapping[str, Floats | float]) -> Floats:
     Args:
         evidence: the quantities in `EVIDENCE`, as numbers or arrays of equal shape, one entry per pose.
     """
-    inliers, ratio, coverage, rival, position_std_m, rotation_std_deg, agreement = (
-        np.asarray(evidence[name], np.float64)
-        for name in EVIDENCE
-    )
+    values = (np.asarray(evidence[name], np.float64) for name in EVIDENCE)
+    inliers, ratio, coverage, rival, position, rotation, agreement = values
     with np.errstate(divide="ignore", invalid="ignore"):
-        logarithms = [np.log(values) for values in (inliers, position_std_m, rotation_std_deg)]
-    columns = [
-        np.ones_like(inliers), logarithms[0], ratio, coverage, rival, logarithms[1], logarithms[2], np.log1p(agreement)
-    ]  # fmt: skip
-    return np.stack(columns, axis=-1)
+        logarithms = np.log(position), np.log(rotation), np.log1p(agreement)
+        return np.stack([np.ones_like(inliers), np.log(inliers), ratio, coverage, rival, *logarithms], axis=-1)
 
 
 def probability_right(evidence: Mapping[str, Floats | float], weights: Floats | None = None) -> Floats:

@@ -24,14 +24,11 @@ from toolkit.manifest import MapSettings, PnpSettings
 from toolkit.mapping.build import MAX_EPIPOLAR_ERROR_PX, instants, match_pairs, select_pairs
 from toolkit.mapping.local_map import LocalMap
 from toolkit.mapping.triangulation import triangulate
-from toolkit.pose.base import Localizer, NetworkMatches, Prior, Query, References
+from toolkit.pose.base import Localizer, Prior, Query, References
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer, PnpMatches
 from toolkit.pose.result import QueryResult
 from toolkit.threads import fixed_sums
-
-FeatureSource = Callable[[str], LocalFeatures]
-"""Returns the features of a map image, given by name; no features if the image cannot be read."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +80,7 @@ class OnDemandLocalizer(Localizer):
         self,
         posed: PosedImages,
         mapped: Sequence[MappedFeatures],
-        on_demand: Sequence[tuple[AnyMethod, FeatureSource]],
+        on_demand: Sequence[tuple[AnyMethod, Callable[[str], LocalFeatures]]],
         map_settings: MapSettings | None = None,
         settings: PnpSettings | None = None,
         seed: int = 0,
@@ -92,7 +89,8 @@ class OnDemandLocalizer(Localizer):
         Args:
             posed: the images of all kinds, in the order of `LocalMap.pooled`.
             mapped: kinds of features with triangulated points. Queries have features of these kinds first.
-            on_demand: kinds of features without points, which follow in the queries, and the source of map features.
+            on_demand: kinds of features without points, which follow in the queries, and for each a function that
+                returns the features of a map image by its name; no features if the image cannot be read.
             map_settings: how points are triangulated.
             settings, seed: as for `PnpLocalizer`.
         """
@@ -114,15 +112,13 @@ class OnDemandLocalizer(Localizer):
             mapped.append(whole.with_map(part))
             point_index.append(first_point + points)
             first_point += len(whole.map.points)
-        network_matches = query.network_matches or [
-            [None] * (len(self.mapped) + len(self.on_demand)) for _ in query.views
-        ]
-        matches = [list(of_camera[: len(self.mapped)]) for of_camera in network_matches]
+        stored_matches = query.network_matches or [[None] * len(self.mapped) for _ in query.views]
+        matches = [list(of_camera[: len(self.mapped)]) for of_camera in stored_matches]
         for number, (method, source) in enumerate(self.on_demand, start=len(self.mapped)):
             features = {name: source(name) for name in names}
             new_matches = self._match(query, references, features, method, number)
             local_map = self.triangulate(images, features, new_matches, KINDS[method.name])
-            mapped.append(MappedFeatures(local_map, features, KINDS[method.name], method.matcher, method.name))
+            mapped.append(MappedFeatures(local_map, features, method.name, method.matcher))
             point_index.append(np.full(len(local_map.points), -1))  # these points are in no map file
             for of_camera, of_kind in zip(matches, new_matches, strict=True):
                 of_camera.append(of_kind.__getitem__)
@@ -133,9 +129,9 @@ class OnDemandLocalizer(Localizer):
     def solve(self, matches: PnpMatches, prediction: None = None, priors: Sequence[Prior] = ()) -> QueryResult:
         """Return one pose for the cameras of a rig, or for a single camera; see `Localizer`."""
         result = matches.localizer.solve(matches, prediction, priors)
+        assert matches.point_index is not None
         used = result.correspondences
-        index = np.concatenate([np.zeros(0, np.int64), *([] if matches.point_index is None else [matches.point_index])])
-        return replace(result, correspondences=replace(used, point_index=index[used.point_index]))
+        return replace(result, correspondences=replace(used, point_index=matches.point_index[used.point_index]))
 
     def _match(
         self,
@@ -146,21 +142,18 @@ class OnDemandLocalizer(Localizer):
         number: int,
     ) -> list[dict[str, PairMatches]]:
         """Return for each query image its matches with its references, by name, of the kind with the given number."""
-        pairs: list[tuple[int, str]] = []
-        to_match: list[tuple[LocalFeatures, LocalFeatures]] = []
+        to_match: dict[tuple[int, str], tuple[LocalFeatures, LocalFeatures]] = {}
         matches: list[dict[str, PairMatches]] = [{} for _ in query.views]
         for camera, (query_features, retrieved) in enumerate(zip(query.features, references, strict=True)):
-            names = [self.posed.names[index] for index in retrieved.images]
-            stored: NetworkMatches | None = query.network_matches[camera][number] if query.network_matches else None
-            if stored is not None:
-                # Matches with an unreadable reference are not stored.
-                matches[camera] = {name: stored(name) if len(features[name]) else PairMatches.none() for name in names}
-            elif not isinstance(query_features, str):
-                pairs += [(camera, name) for name in names]
-                to_match += [(query_features[number], features[name]) for name in names]
+            stored = query.network_matches[camera][number] if query.network_matches else None
+            for name in (self.posed.names[index] for index in retrieved.images):
+                if stored is not None:  # matches with an unreadable reference are not stored
+                    matches[camera][name] = stored(name) if len(features[name]) else PairMatches.none()
+                elif not isinstance(query_features, str):
+                    to_match[camera, name] = query_features[number], features[name]
         with self._network:
-            new_matches = method.matcher.match(to_match)
-        for (camera, name), pair_matches in zip(pairs, new_matches, strict=True):
+            new_matches = method.matcher.match(list(to_match.values()))
+        for (camera, name), pair_matches in zip(to_match, new_matches, strict=True):
             matches[camera][name] = pair_matches
         return matches
 
@@ -194,31 +187,18 @@ class OnDemandLocalizer(Localizer):
                     continue
                 _, at_i, at_j = np.intersect1d(with_i[:, 0], with_j[:, 0], assume_unique=True, return_indices=True)
                 through_query = np.column_stack([with_i[at_i, 1], with_j[at_j, 1]])
-                errors = [
-                    _epipolar_errors_px(
-                        (cameras[a], cameras[b]),
-                        geometry.invert(poses[b]) @ poses[a],
-                        loaded[a].keypoints[through_query[:, first]],
-                        loaded[b].keypoints[through_query[:, 1 - first]],
-                    )
-                    for a, b, first in ((i, j, 0), (j, i, 1))
-                ]
+                in_i = cameras[i], poses[i], loaded[i].keypoints[through_query[:, 0]]
+                in_j = cameras[j], poses[j], loaded[j].keypoints[through_query[:, 1]]
+                errors_px = np.maximum(_epipolar_errors_px(*in_i, *in_j), _epipolar_errors_px(*in_j, *in_i))
                 earlier = matches.get((i, j), np.zeros((0, 2), np.int64))
                 # A keypoint has one partner in an image: the first one found.
-                new = np.max(errors, axis=0) < MAX_EPIPOLAR_ERROR_PX
+                new = errors_px < MAX_EPIPOLAR_ERROR_PX
                 new &= ~np.isin(through_query[:, 0], earlier[:, 0]) & ~np.isin(through_query[:, 1], earlier[:, 1])
                 matches[i, j] = np.concatenate([earlier, through_query[new]])
         ordered = sorted(matches)
-        local_map = triangulate(
-            names,
-            cameras,
-            poses,
-            [image_features.keypoints for image_features in loaded],
-            np.array(ordered, np.int64).reshape(-1, 2),
-            [matches[pair] for pair in ordered],
-            settings,
-            self._seed,
-        )
+        keypoints, numbers = [image.keypoints for image in loaded], np.array(ordered, np.int64).reshape(-1, 2)
+        along_pairs = [matches[pair] for pair in ordered]
+        local_map = triangulate(names, cameras, poses, keypoints, numbers, along_pairs, settings, self._seed)
         return replace(
             local_map,
             image_names=posed.names,
@@ -229,14 +209,19 @@ class OnDemandLocalizer(Localizer):
 
 
 def _epipolar_errors_px(
-    cameras: tuple[pycolmap.Camera, pycolmap.Camera], b_from_a: Floats, pixels_a: Floats, pixels_b: Floats
+    camera_a: pycolmap.Camera,
+    world_from_a: Floats,
+    pixels_a: Floats,
+    camera_b: pycolmap.Camera,
+    world_from_b: Floats,
+    pixels_b: Floats,
 ) -> Floats:
     """Return the distances (K,) of pixels (K, 2) of image b from the epipolar lines of pixels of image a, pixels.
 
     They are inf if there is no baseline.
     """
-    baseline = b_from_a[:3, 3]
-    normals = np.cross(baseline, rays_of(cameras[0], pixels_a) @ b_from_a[:3, :3].T)
+    b_from_a = geometry.invert(world_from_b) @ world_from_a
+    normals = np.cross(b_from_a[:3, 3], rays_of(camera_a, pixels_a) @ b_from_a[:3, :3].T)
     lengths = np.linalg.norm(normals, axis=1)
-    sines = np.abs((normals * rays_of(cameras[1], pixels_b)).sum(axis=1)) / np.maximum(lengths, 1e-12)
-    return np.where(lengths > 1e-6, sines * cameras[1].mean_focal_length(), np.inf)
+    sines = np.abs((normals * rays_of(camera_b, pixels_b)).sum(axis=1)) / np.maximum(lengths, 1e-12)
+    return np.where(lengths > 1e-6, sines * camera_b.mean_focal_length(), np.inf)

@@ -55,30 +55,28 @@ class MappedFeatures:
         self,
         local_map: LocalMap,
         features: Mapping[str, LocalFeatures],
-        kind: FeatureKind = KINDS["sift"],
-        matcher: Matcher | None = None,
         name: str = "sift",
+        matcher: Matcher | None = None,
+        kind: FeatureKind | None = None,
     ):
         """
         Args:
             local_map: the map triangulated from the features.
             features: features of the map images, by name.
-            kind: entry of the features in `KINDS`.
+            name: of the kind of features.
             matcher: None: `mutual` with the limits of the kind. Any `mutual` compares descriptors as the kind says.
-            name: key of the features in `KINDS`.
+            kind: None: that of the name in `KINDS`.
         """
-        self.map = local_map
-        self.features = features
-        self.kind = kind
-        self.matcher = matcher or MutualMatcher.of(kind)
-        self.name = name
+        self.map, self.features, self.name = local_map, features, name
+        self.kind = kind or KINDS[name]
+        self.matcher = matcher or MutualMatcher.of(self.kind)
         self.image = lru_cache(CACHED_IMAGES)(self._image)
         """Cached `_image`."""
         self._network = Lock()
 
     def with_map(self, local_map: LocalMap) -> "MappedFeatures":
         """Return the same features with another map of their images."""
-        return MappedFeatures(local_map, self.features, self.kind, self.matcher, self.name)
+        return MappedFeatures(local_map, self.features, self.name, self.matcher, self.kind)
 
     def match(
         self,

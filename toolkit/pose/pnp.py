@@ -114,10 +114,8 @@ class PnpLocalizer(Localizer):
     """
 
     def __init__(self, mapped: Sequence[MappedFeatures], settings: PnpSettings | None = None, seed: int = 0):
-        self.seed = seed
-        consistency = mapped[0].map.consistency
+        self.seed, consistency, settings = seed, mapped[0].map.consistency, settings or PnpSettings()
         self._noise_deg = consistency.direction_noise_deg
-        settings = settings or PnpSettings()
         # Noise of the map's poses asks for a wider search.
         limit = max(settings.max_error_deg, 1.5 * self._noise_deg)
         self.settings = settings.model_copy(update={"max_error_deg": limit})
@@ -153,8 +151,7 @@ class PnpLocalizer(Localizer):
             result = self._estimate(rig, all_matches, hypotheses, references)
         else:
             reason = "no consistent pose" if len(np.unique(all_matches.point)) >= 4 else "too few matches"
-            rejected = self._rejected(all_matches)
-            result = QueryResult.failed(reason, num_matches=len(all_matches), correspondences=rejected)
+            result = self._failed(reason, all_matches)
         for prior in priors:
             result = self._compare(rig, all_matches, hypotheses, result, references, prior)
         result = self._with_misfit(rig, all_matches, result)
@@ -181,14 +178,13 @@ class PnpLocalizer(Localizer):
             return estimate
         covariance = estimate.covariance
         wider = None if covariance is None else covariance + np.outer(misfit.shift, misfit.shift)
+        estimate = replace(estimate, covariance=wider, misfit=True)
         if not misfit.doubtful:
-            return replace(estimate, covariance=wider, misfit=True)
+            return estimate
         return replace(
             estimate,
             status=Status.LOW_CONFIDENCE,
             reason=CAMERA,
-            covariance=wider,
-            misfit=True,
             focals_px=misfit.focals_px(query.cameras),
             centers_px=misfit.centers_px(query.cameras),
             remark=misfit.reason(query.cameras),
@@ -207,7 +203,9 @@ class PnpLocalizer(Localizer):
         if estimate.status is Status.OK and agree(estimate.world_from_rig, prior.world_from_rig):
             return estimate  # each confirms the other
         rig_from_world = geometry.invert(prior.world_from_rig)
-        vicinity = self.matcher.vicinity(query, rig_from_world, self._covisible(prior.images), prior.radius_deg)
+        points = [self.map.observations(int(image))[1] for image in prior.images]
+        images = self.matcher.covisible(np.unique(np.concatenate([np.zeros(0, np.int64), *points])))
+        vicinity = self.matcher.vicinity(query, rig_from_world, images, prior.radius_deg)
         near = vicinity.guided(rig_from_world, prior.radius_deg, MAX_GUIDED_MATCHES)
         start = self._ransac(query, near, self.settings.ransac_max_error_deg) if len(near) else None
         if start is None:
@@ -229,11 +227,6 @@ class PnpLocalizer(Localizer):
             return estimate
         rivals = sorted([*hypotheses, hypothesis], key=lambda rival: -rival.support)
         return self._estimate(query, matches, rivals, references)
-
-    def _covisible(self, images: Ints) -> Ints:
-        """Return the map images that observe the most points of the given map images."""
-        points = [self.map.observations(int(image))[1] for image in images]
-        return self.matcher.covisible(np.unique(np.concatenate([np.zeros(0, np.int64), *points])))
 
     def _first_pose(
         self, of_query: PnpMatches, references: Sequence[References]
@@ -361,12 +354,8 @@ class PnpLocalizer(Localizer):
         inliers = matches[self._inliers(query, rig_from_world, matches)]
         independent = self._independent(inliers)
         if independent < settings.min_inliers:
-            return QueryResult.failed(
-                f"too few inliers ({independent} within {settings.ransac_max_error_deg} deg)",
-                num_matches=len(matches),
-                num_inliers=independent,
-                correspondences=self._rejected(matches),
-            )
+            reason = f"too few inliers ({independent} within {settings.ransac_max_error_deg} deg)"
+            return self._failed(reason, matches, independent)
         errors, rivals = query.errors_px(rig_from_world, guided, self.map.points), self._rivals(hypotheses)
         unguided = matches[~np.isin(matches.rows(), guided.rows())]
         unguided_agree = query.errors_deg(rig_from_world, unguided, self.map.points) < settings.max_error_deg
@@ -393,9 +382,8 @@ class PnpLocalizer(Localizer):
         evidence = {name: getattr(estimate, name) for name in EVIDENCE}
         probability = bounded_by_rivals(float(probability_right(evidence)), [rival.support for rival in rivals])
         probability = bounded_by_deviation(probability, estimate.position_std_m, estimate.rotation_std_deg)
-        estimate = replace(estimate, p_correct=probability)
-        certain = estimate.p_correct >= settings.ok_probability and estimate.rival_support <= MAX_RIVAL_SUPPORT
-        return estimate if certain else replace(estimate, status=Status.LOW_CONFIDENCE)
+        certain = probability >= settings.ok_probability and estimate.rival_support <= MAX_RIVAL_SUPPORT
+        return replace(estimate, status=Status.OK if certain else Status.LOW_CONFIDENCE, p_correct=probability)
 
     def _agreement(self, inliers: Matches) -> int:
         """Return the number of inlier points of the kind of features that has the second most."""
@@ -452,9 +440,10 @@ class PnpLocalizer(Localizer):
         share = limit_px**2 / np.maximum(np.trace(noise, axis1=1, axis2=2), 1e-12)
         return np.asarray(noise * np.minimum(share, 1)[:, None, None], np.float64)
 
-    def _rejected(self, matches: Matches) -> Correspondences:
-        """Return the correspondences of matches that support no pose."""
-        return self._correspondences(matches, np.zeros(len(matches), bool), 0, [])
+    def _failed(self, reason: str, matches: Matches, inliers: int = 0) -> QueryResult:
+        """Return a result without a pose; none of the matches agrees with one."""
+        rejected = self._correspondences(matches, np.zeros(len(matches), bool), 0, [])
+        return QueryResult.failed(reason, num_matches=len(matches), num_inliers=inliers, correspondences=rejected)
 
     def _rivals(self, hypotheses: list[_Hypothesis]) -> list[Rival]:
         """Return the poses that clearly differ from the best and from each other, with their relative support."""
@@ -477,13 +466,13 @@ def _differ(hypothesis: _Hypothesis, other: _Hypothesis) -> bool:
 def _of_all_images(matches: PnpMatches, result: QueryResult, missing: str) -> QueryResult:
     """Return a result that counts all images of the query, not only the usable ones; `missing` says why."""
     used = np.array(matches.usable, np.int64)[result.correspondences.camera]
-    focals_px, centers_px = np.full(len(matches.query.views), np.nan), np.full((len(matches.query.views), 2), np.nan)
-    focals_px[matches.usable] = result.focals_px or np.nan
-    centers_px[matches.usable] = np.array(result.centers_px).reshape(-1, 2) if result.centers_px else np.nan
+    fitted = np.full((len(matches.query.views), 3), np.nan)
+    if result.focals_px:
+        fitted[matches.usable] = np.column_stack([result.focals_px, result.centers_px])
     return replace(
         result,
         correspondences=replace(result.correspondences, camera=used),
-        focals_px=tuple(focals_px.tolist()),
-        centers_px=tuple((x, y) for x, y in centers_px.tolist()),
+        focals_px=tuple(fitted[:, 0].tolist()),
+        centers_px=tuple((x, y) for _, x, y in fitted.tolist()),
         remark="; ".join(filter(None, [result.remark, missing])),
     )

@@ -266,12 +266,14 @@ class QueryResult:
             if array.shape != (count, *(_STORED[key][1] if key in _STORED else ())):
                 raise ValueError(f"{key} has the shape {array.shape}")
         pose, covariance = arrays["world_from_rig"], arrays["covariance"]
-        names = {name: tuple(_text(text) for text in arrays[name]) for name in _NAMES}
+        images, references, rejected = (tuple(_text(text) for text in arrays[name]) for name in _NAMES)
         return cls(
             Status.FAILED,
             world_from_rig=None if np.isnan(pose).all() else pose,
             covariance=None if np.isnan(covariance).all() else covariance,
-            **names,
+            images=images,
+            references=references,
+            rejected=rejected,
             correspondences=Correspondences(**read, found_by=found_by),
             rivals=tuple(map(Rival, arrays["rivals"].reshape(-1, 4, 4), arrays["rival_supports"].tolist())),
             misfit=bool(arrays["misfit"]),

@@ -52,8 +52,8 @@ from toolkit.scene.opening import (
     Localized,
     how_localized,
     last_localized,
+    pairs_in_map,
     session_fingerprint,
-    unknown,
 )  # fmt: skip
 from toolkit.scene.query import Image, query_from
 from toolkit.scene.search import ReferenceSearch
@@ -132,7 +132,7 @@ class Map:
                 session, store, path, settings.map, settings.seed, skip_existing, inputs, workers,
                 settings.unit is not None, scene_map.refined_poses or None,
             )  # fmt: skip
-            mapped.append(MappedFeatures(local_map, store, KINDS[kind.name], kind.matcher, kind.name))
+            mapped.append(MappedFeatures(local_map, store, kind.name, kind.matcher))
         if scene_map.remarks:
             log.warning("%s: %s", session.id, scene_map.remarks)
         return scene_map
@@ -154,10 +154,7 @@ class Map:
             if not isinstance(value, kind):
                 raise ArtifactError(f"Map.open: found {value!r}, expected a run folder, a scene name and a device key.")
         files = SceneFiles(Path(run), scene)
-        pairs = sorted(files.poses_dir.glob(f"{scene}_map_{device}_query_*.h5"))
-        if not pairs:
-            raise ArtifactError(f"{unknown(files, device)} Localize first: python -m toolkit run MANIFEST.")
-        localized = last_localized(files, pairs)
+        localized = last_localized(files, pairs := pairs_in_map(files, device))
         for pair in pairs:
             require_current(pair.with_suffix(".txt"), "localize", missing=False)
         reranked = Path(localized[1][RETRIEVAL]).name == files.reranked_dir.name
@@ -180,17 +177,10 @@ class Map:
     @classmethod
     def _stored_in(cls, device: str, localized: Localized, features_dir: Path, map_dir: Path) -> "Map":
         settings, h5_attributes, names = localized
-        kinds, escalation = create_methods(settings)
-        mapped = [
-            MappedFeatures(
-                LocalMap.load(map_dir / name),
-                FeatureStore.of_session(features_dir, f"{device}_map", kind.extractor.settings),
-                KINDS[kind.name],
-                kind.matcher,
-                kind.name,
-            )
-            for name, kind in zip(names, kinds if settings.map is not None else (), strict=True)
-        ]
+        (kinds, escalation), mapped = create_methods(settings), list[MappedFeatures]()
+        for name, kind in zip(names, kinds if settings.map is not None else (), strict=True):
+            store = FeatureStore.of_session(features_dir, f"{device}_map", kind.extractor.settings)
+            mapped.append(MappedFeatures(LocalMap.load(map_dir / name), store, kind.name, kind.matcher))
         root = Path(h5_attributes[SESSIONS_ROOT])
         return cls(device, root, map_dir, settings, kinds, mapped, escalation, features_dir)
 
@@ -248,21 +238,36 @@ class Map:
         Raises:
             ArtifactError: the map was not opened from a run, or was embedded by another embedder.
         """
-        poses = [] if near is None else list(near.world_from_rig @ query.rig_from_cams)
-        allowed = [self._may_show(pose, near) for pose in poses if near is not None]
-        references = []
+        references, allowed = list[References](), list[NDArray[np.bool_] | None]()
+        if near is not None:
+            allowed = [self._may_show(pose, near) for pose in near.world_from_rig @ query.rig_from_cams]
         for rows, scores in self.search.find(query, k, allowed):
             indices = np.array([self.index_of.get(self.session.image_name(int(row)), -1) for row in rows], np.int64)
             references.append(References(indices[indices >= 0], scores[indices >= 0]))
         return references
 
-    def match(self, query: Query, references: Sequence[References]) -> QueryMatches:
-        """Return the matches of a described query with its references; they are computed when they are needed."""
-        return self._match(self.localizer, query, references)
+    def match(
+        self, query: Query, references: Sequence[References], localizer: Localizer | None = None
+    ) -> QueryMatches:
+        """Return the matches of a described query with its references; they are computed when they are needed.
 
-    def solve(self, query: Query, matches: QueryMatches) -> QueryResult:
-        """Return the pose of a query from its matches, without fallback features."""
-        return self.finished(query, self._solve(self.localizer, matches))
+        Localizers assume map lengths, and so do the matches. `localizer` is that of the map or, with the fallback
+        features, `fallback`; the same one solves the matches.
+        """
+        return (localizer or self.localizer).match(query.scaled(1 / self.length), references)
+
+    def solve(
+        self,
+        query: Query,
+        matches: QueryMatches,
+        prediction: Any = None,
+        priors: Sequence[Prior] = (),
+        localizer: Localizer | None = None,
+    ) -> QueryResult:
+        """Return the pose of a query from its matches, in the unit of the map's poses; see `Localizer.solve`."""
+        in_lengths = [prior.scaled(1 / self.length) for prior in priors]
+        result = (localizer or self.localizer).solve(matches, prediction, in_lengths)
+        return self.finished(query, result.scaled(self.length))
 
     @fixed_sums
     def locate(
@@ -295,8 +300,8 @@ class Map:
         query = self.describe(query) if references is None else self._with_features(query)
         references = self.retrieve(query, near=near) if references is None else references
         priors = [] if near is None else [self._prior(near, references)]
-        result = self._solve(self.localizer, self._match(self.localizer, query, references), prediction, priors)
-        result = self.finished(query, replace(result, seconds=time.perf_counter() - started))
+        result = self.solve(query, self.match(query, references), prediction, priors)
+        result = replace(result, seconds=time.perf_counter() - started)
         if fallback and self.needs_fallback(query, references, result):
             return self.retry(self._with_fallback_features(query), references, result, priors)
         return result
@@ -333,27 +338,16 @@ class Map:
         known_priors = [
             Prior(pose, images, SEARCH_DEG[0], "first") for pose in known if len(images := self._images_near(pose))
         ]
-        matches = self._match(self.fallback, query, references)
-        result = self._solve(self.fallback, matches, None, [*priors, *known_priors])
+        matches = self.match(query, references, self.fallback)
+        result = self.solve(query, matches, None, [*priors, *known_priors], self.fallback)
         result = replace(result, found_by="+".join([result.found_by, *(kind.name for kind in self.escalation)]))
         better = result.status.rank >= max(first.status.rank, 1)
         return replace(
-            self.finished(query, result) if better else first,
+            result if better else first,
             seconds=first.seconds + time.perf_counter() - started,
             first_status=first.status_text,
             first_seconds=round(first.seconds, 4),
         )
-
-    def _match(self, localizer: Localizer, query: Query, references: Sequence[References]) -> QueryMatches:
-        """Return the matches, in map lengths."""
-        return localizer.match(query.scaled(1 / self.length), references)
-
-    def _solve(
-        self, localizer: Localizer, matches: QueryMatches, prediction: Any = None, priors: Sequence[Prior] = ()
-    ) -> QueryResult:
-        """Return the pose in the unit of the map's poses; matches and prediction are in map lengths."""
-        in_lengths = [prior.scaled(1 / self.length) for prior in priors]
-        return localizer.solve(matches, prediction, in_lengths).scaled(self.length)
 
     def finished(self, query: Query, result: QueryResult) -> QueryResult:
         """Return a result with the names of images and method; with low confidence if the map contradicts itself."""
@@ -558,25 +552,24 @@ class Map:
         if not self.mapped:
             return ""
         parts, depth = [self.consistency.text, self._noise], self.length * USUAL_DEPTHS_M[int(self.length > 1)]
-        plausible = self.consistency.verdict != "inconsistent"
-        if plausible and self.settings.unit and self.length != 1 and not ODD_DEPTHS_M[0] < depth < ODD_DEPTHS_M[1]:
-            odd = f"the median depth of the map is {depth:.3g} m"
-            fix = "write `unit: null` in the manifest, or import them with their `--unit`"
-            parts.append(f"{odd}: if its poses are not in meters, {fix}")
+        metric = self.settings.unit and self.length != 1 and self.consistency.verdict != "inconsistent"
+        if metric and not ODD_DEPTHS_M[0] < depth < ODD_DEPTHS_M[1]:
+            parts.append(
+                f"the median depth of the map is {depth:.3g} m: if its poses are not in meters, write `unit: null` in "
+                "the manifest, or import them with their `--unit`"
+            )
         return "; ".join(filter(None, parts))
 
     @property
     def _noise(self) -> str:
         """How good the poses are, if their noise is worth a word."""
         noise = self.consistency
-        if not noise.trusted:  # wrong intrinsics look like noise of the poses
+        small = noise.rotation_noise_deg < WORTH_DEG and noise.position_noise < WORTH_LENGTHS
+        if small or not noise.trusted:  # wrong intrinsics look like noise of the poses
             return ""
-        if noise.rotation_noise_deg < WORTH_DEG and noise.position_noise < WORTH_LENGTHS:
-            return ""
-        unit, factor = ("m", 1.0) if self.settings.unit else ("of the median depth", 1 / NOMINAL_DEPTH)
-        position = np.sqrt(3) * noise.position_noise * (self.length if self.settings.unit else factor)
-        text = f"{100 * position:.2g} c{unit}" if unit == "m" else f"{100 * position:.2g} % {unit}"
-        return f"the poses of the map are good to about {np.sqrt(3) * noise.rotation_noise_deg:.2g} deg, {text}"
+        unit, factor = ("cm", self.length) if self.settings.unit else ("% of the median depth", 1 / NOMINAL_DEPTH)
+        rotation_deg, position = np.sqrt(3) * noise.rotation_noise_deg, np.sqrt(3) * noise.position_noise * factor
+        return f"the poses of the map are good to about {rotation_deg:.2g} deg, {100 * position:.2g} {unit}"
 
     def record(self) -> dict[str, Any]:
         """Return the unit, depth, length and consistency of the map, for JSON."""

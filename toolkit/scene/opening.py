@@ -22,32 +22,50 @@ from toolkit.store.hdf5 import HDF5_ERRORS
 SETTINGS, SESSIONS_ROOT, RETRIEVAL = "settings", "sessions_root", "retrieval_dir"
 """Attributes of `poses/<pair>.h5`: the settings that the pair was localized with, the `sessions` folder of the capture,
 and the folder of the references."""
+_FIRST = "Localize first: python -m toolkit run MANIFEST."
 
 
-def no_such_run(run: Path) -> str:
-    """Return a message that lists the runs beside a folder that is none."""
-    return f"{run}: no such run. {nearest(run.name, [path.parent.name for path in run.parent.glob(f'*/{RECORD}')])}"
+def no_such_run(run: Path) -> ArtifactError:
+    """Return an error that lists the runs beside a folder that is none."""
+    known = [path.parent.name for path in run.parent.glob(f"*/{RECORD}")]
+    return ArtifactError(f"{run}: no such run. {nearest(run.name, known)}")
 
 
 def localized_scenes(run: Path) -> list[str]:
-    """Return the names of the captures that a run has localized, in order."""
+    """Return the names of the captures that a run has localized, in order.
+
+    Raises:
+        ArtifactError: there is no such run.
+    """
+    if not run.is_dir():
+        raise no_such_run(run)
     return sorted(path.parent.name for path in run.glob("*/poses"))
 
 
-def unknown(files: SceneFiles, device: str) -> str:
-    """Return a message that says which of run, scene and device is unknown, and lists the known ones."""
-    run = files.run
-    if not run.is_dir():
-        return no_such_run(run)
-    scenes = localized_scenes(run)
-    if files.scene not in scenes:
-        return f"{run}: no poses of the scene {files.scene!r}. {nearest(files.scene, scenes)}"
-    devices = {pair_devices(path.stem)[0] for path in files.poses_dir.glob("*.h5")}
-    return f"{files.poses_dir}: no poses of queries in the map of {device!r}. {nearest(device, devices)}"
+def pairs_in_map(files: SceneFiles, device: str) -> list[Path]:
+    """Return `poses/<pair>.h5` of all pairs with a map device.
+
+    Raises:
+        ArtifactError: unknown run, scene or device; the message lists the known ones.
+    """
+    if files.scene not in (scenes := localized_scenes(files.run)):
+        known = nearest(files.scene, scenes)
+        raise ArtifactError(f"{files.run}: no poses of the scene {files.scene!r}. {known} {_FIRST}")
+    pairs = {path: pair_devices(path.stem)[0] for path in sorted(files.poses_dir.glob("*.h5"))}
+    if device not in pairs.values():
+        known = nearest(device, set(pairs.values()))
+        raise ArtifactError(f"{files.poses_dir}: no poses of queries in the map of {device!r}. {known} {_FIRST}")
+    return [path for path, mapped in pairs.items() if mapped == device]
 
 
 Localized = tuple[LocalizeSettings, dict[str, Any], list[str]]
 """Settings that a pair was localized with, attributes of its `.h5` file, and the file names of its maps."""
+
+
+def _unreadable(path: Path, error: Exception) -> ArtifactError:
+    other = "another version of the toolkit wrote it"
+    problem = other if isinstance(error, ManifestError) else f"cannot read its settings ({error})"
+    return ArtifactError(f"{path}: {problem}. Run its stage again.")
 
 
 def how_localized(pair: Path) -> Localized:
@@ -62,11 +80,9 @@ def how_localized(pair: Path) -> Localized:
     try:
         with h5py.File(pair, "r") as file:
             attributes = dict(file.attrs)
-            return LocalizeSettings.of(json.loads(attributes[SETTINGS])), attributes, json.loads(attributes[MAPS])
-    except ManifestError:
-        raise ArtifactError(f"{pair}: another version of the toolkit has localized it. Localize again.") from None
+        return LocalizeSettings.of(json.loads(attributes[SETTINGS])), attributes, json.loads(attributes[MAPS])
     except (*HDF5_ERRORS, ToolkitError) as error:
-        raise ArtifactError(f"{pair}: cannot read how it was localized ({error}). Localize again.") from None
+        raise _unreadable(pair, error) from None
 
 
 def last_localized(files: SceneFiles, pairs: Sequence[Path]) -> Localized:
@@ -74,17 +90,16 @@ def last_localized(files: SceneFiles, pairs: Sequence[Path]) -> Localized:
 
     The last run is known by its settings file. File times would be unreliable, as clocks can be set back.
     """
-    last = None
+    last, localized, errors = None, list[Localized](), list[ArtifactError]()
     with suppress(ArtifactError):  # the run is of a version that wrote no such file, or other settings
         last = read_settings(files.poses_dir / "settings.json", LocalizeSettings)
-    localized, message = [], ""
     for pair in pairs:
         try:
             localized.append(how_localized(pair))
         except ArtifactError as error:
-            message = str(error)
+            errors.append(error)
     if not localized:
-        raise ArtifactError(message)
+        raise errors[-1]
     return next((one for one in localized if one[0] == last), localized[-1])
 
 
@@ -99,10 +114,8 @@ def read_settings(path: Path, model: type[AnySettings]) -> AnySettings:
     """
     try:
         return model.of(json.loads(path.read_text(encoding="utf-8")))
-    except ManifestError:
-        raise ArtifactError(f"{path}: another version of the toolkit wrote it. Run the stage again.") from None
-    except (OSError, ValueError) as error:
-        raise ArtifactError(f"{path}: cannot read the settings of the stage ({error}). Run the stage again.") from None
+    except (OSError, ValueError, ManifestError) as error:
+        raise _unreadable(path, error) from None
 
 
 def session_fingerprint(session: Session) -> str:

@@ -49,17 +49,9 @@ def query_from(
             f"Found {len(images)} images, {len(cameras)} cameras, {len(poses)} rig_from_cams and "
             f"{len(quarter_turns)} turns: expected the same number of each, and at least one."
         )
-    views = [
-        View(
-            f"image {number}",
-            Path(one) if isinstance(one, str | Path) else pixels_from(one),
-            intrinsics,
-            in_map=False,
-            turns=turn,
-        )
-        for number, (one, intrinsics, turn) in enumerate(zip(images, cameras, quarter_turns, strict=True), start=1)
-    ]
-    return Query(views, poses)
+    pixels = [Path(one) if isinstance(one, str | Path) else pixels_from(one) for one in images]
+    numbered = enumerate(zip(pixels, cameras, quarter_turns, strict=True), start=1)
+    return Query([View(f"image {k}", image, one, False, turn) for k, (image, one, turn) in numbered], poses)
 
 
 def pixels_from(image: Any) -> NDArray[np.uint8]:
@@ -74,22 +66,20 @@ def pixels_from(image: Any) -> NDArray[np.uint8]:
         ImageError: anything else.
     """
     expected = "Expected a file or the pixels of an image: (H, W) or (H, W, 3) RGB, uint8."
-    if image is None or isinstance(image, bytes | dict | set):
-        raise ImageError(f"Found {image if image is None else type(image).__name__} for an image. {expected}")
     if hasattr(image, "getbands"):  # a Pillow image
         image = image if image.mode in ("1", "L", "RGB", "F") or image.mode.startswith("I") else image.convert("RGB")
     try:
         pixels = np.asarray(image)
     except (ValueError, TypeError, RuntimeError) as error:  # lists of different lengths; a tensor on a GPU
         raise ImageError(f"Found a {type(image).__name__} that is not an array ({error}). {expected}") from None
-    found = f"{pixels.shape} {pixels.dtype}"
+    found = f"a {type(image).__name__} of pixels {pixels.shape} {pixels.dtype}"
     if pixels.ndim == 3 and pixels.shape[0] in (1, 3) and pixels.shape[2] not in (1, 3):
         pixels = np.moveaxis(pixels, 0, 2)
     if pixels.ndim == 3 and pixels.shape[2] == 1:
         pixels = pixels[:, :, 0]
     shape_fits = pixels.ndim in (2, 3) and pixels.shape[2:] in ((), (3,)) and pixels.size
     if not shape_fits or pixels.dtype.kind not in "buif":
-        raise ImageError(f"Found pixels {found}. {expected}")
+        raise ImageError(f"Found {found}. {expected}")
     if pixels.dtype == np.uint8:
         return pixels
     if pixels.dtype == bool:
@@ -98,7 +88,7 @@ def pixels_from(image: Any) -> NDArray[np.uint8]:
         return (pixels >> 8).astype(np.uint8)  # as a 16-bit file is decoded
     low, high = pixels.min(), pixels.max()
     if not (low >= 0 and high <= 255):
-        raise ImageError(f"Found pixels {found} from {low:g} to {high:g}; expected 0 to 1, or 0 to 255.")
+        raise ImageError(f"Found {found} from {low:g} to {high:g}; expected 0 to 1, or 0 to 255.")
     scale = 255 if pixels.dtype.kind == "f" and high <= 1 else 1
     return np.round(pixels * scale).astype(np.uint8)
 
@@ -109,11 +99,7 @@ def _are_several(image: Any) -> bool:
 
 
 def _check_camera(camera: Any) -> None:
-    """Check that an object is a camera with valid intrinsics.
-
-    Raises:
-        CameraError: it is not.
-    """
+    """Raise CameraError if an object is not a camera with valid intrinsics."""
     if not isinstance(camera, pycolmap.Camera):
         raise CameraError(
             f"camera: found {camera!r}, a {type(camera).__name__}; expected a pycolmap.Camera. To make one: "
@@ -149,5 +135,4 @@ def _turns(turns: Any) -> list[int]:
     try:
         return [operator.index(turn) for turn in turns]
     except TypeError:
-        expected = "expected whole numbers of quarter turns, one per image"
-        raise CameraError(f"turns: found {turns!r}, {expected}.") from None
+        raise CameraError(f"turns: found {turns!r}, expected whole numbers of quarter turns, one per image.") from None

@@ -30,7 +30,7 @@ class Run:
         """
         path = Path(path)
         if not (path / RECORD).is_file():
-            raise ArtifactError(no_such_run(path))
+            raise no_such_run(path)
         return cls(path)
 
     @cached_property

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,22 +53,18 @@ class ReferenceSearch:
 
     def describe(self, query: Query, kinds: Sequence[LocalMethod]) -> list[NDArray[np.float32]]:
         """Return for each embedder the global descriptors (C, D) of a query's images; `kinds` are its features."""
-        return [self._described(embedder, query, kinds) for embedder in self.embedders]
+        return [embedder.embed(self._inputs(embedder, query, kinds)) for embedder in self.embedders]
 
-    def _described(self, embedder: Embedder, query: Query, kinds: Sequence[LocalMethod]) -> NDArray[np.float32]:
-        if embedder.inputs == "features":
-            sift, settings = SiftExtractor(), [kind.extractor.settings for kind in kinds]
-            if query.features and sift.settings in settings:  # the embedder can use the features of the localizer
-                at = settings.index(sift.settings)
-                inputs = [features[at] for features in query.features if not isinstance(features, str)]
-            else:
-                inputs = sift.extract([view.read(color=False) for view in query.views])
-        else:
+    def _inputs(self, embedder: Embedder, query: Query, kinds: Sequence[LocalMethod]) -> list[Any]:
+        if embedder.inputs != "features":
             turned, side = shows_upright(embedder, self.embed_settings.upright), embedder.least_side
-            inputs = [
-                embedder.prepare(turn_image(view.read(True, side), view.turns if turned else 0)) for view in query.views
-            ]
-        return embedder.embed(inputs)
+            images = (turn_image(view.read(True, side), view.turns if turned else 0) for view in query.views)
+            return [embedder.prepare(image) for image in images]
+        sift, settings = SiftExtractor(), [kind.extractor.settings for kind in kinds]
+        if query.features and sift.settings in settings:  # the embedder can use the features of the localizer
+            at = settings.index(sift.settings)
+            return [features[at] for features in query.features if not isinstance(features, str)]
+        return sift.extract([view.read(color=False) for view in query.views])
 
     def find(
         self, query: Query, k: int | None = None, allowed: Sequence[NDArray[np.bool_] | None] = ()
@@ -82,20 +79,20 @@ class ReferenceSearch:
         Raises:
             ArtifactError: the map was embedded by another embedder.
         """
-        database, rows = self._descriptors
-        dims = self._stored[0].dims
-        for embedder, vectors, dim in zip(self.embedders, query.descriptors, dims, strict=True):
-            if vectors.shape[1] != dim:
+        stored, rows = self._stored
+        dims = stored.dims
+        for embedder, described, dim in zip(self.embedders, query.descriptors, dims, strict=True):
+            if described.shape[1] != dim:
                 raise ArtifactError(
                     f"{self.files.embeddings}: found descriptors of {dim} dimensions for the map, expected "
-                    f"{vectors.shape[1]} of {embedder.name}. Run the embed stage again."
+                    f"{described.shape[1]} of {embedder.name}. Run the embed stage again."
                 )
-        described = np.hstack([self._as_searched(vectors) for vectors in query.descriptors])
+        searched = np.hstack([self._as_searched(vectors) for vectors in query.descriptors])
         topk = self.retrieve_settings.topk if k is None or self.reranked else k
         masks = list(allowed) or [None]
         results = [
-            search(part, database, topk, "torch", "cpu", index=self._index, allowed=mask, dims=dims)
-            for part, mask in zip(np.split(described, len(masks)), masks, strict=True)
+            search(part, self._descriptors, topk, "torch", "cpu", index=self._index, allowed=mask, dims=dims)
+            for part, mask in zip(np.split(searched, len(masks)), masks, strict=True)
         ]
         all_scores, neighbors = (np.concatenate(arrays) for arrays in zip(*results, strict=True))
         ranked = [
@@ -172,11 +169,10 @@ class ReferenceSearch:
         return vectors.choose(np.flatnonzero(posed)), rows[posed]
 
     @cached_property
-    def _descriptors(self) -> tuple[NDArray[np.float32] | Vectors, NDArray[np.int64]]:
-        """`_stored`, in memory unless the map is large."""
-        vectors, rows = self._stored
-        small = 4 * vectors.shape[1] * len(vectors) < MAX_IN_MEMORY
-        return vectors[:] if small else vectors, rows
+    def _descriptors(self) -> NDArray[np.float32] | Vectors:
+        """Those of `_stored`, in memory unless the map is large."""
+        vectors = self._stored[0]
+        return vectors[:] if 4 * vectors.shape[1] * len(vectors) < MAX_IN_MEMORY else vectors
 
     @cached_property
     def _index(self) -> VectorIndex | None:
