@@ -306,11 +306,11 @@ class _Stage(Remade):
         return {"unit": self.settings.unit, "maps": [read_sidecar(path) for path in maps]}
 
     def _open_map(self, device: str) -> Map:
-        folders = self.folders
-        return Map.build(
-            self.capture, device, self.settings, self.kinds, folders.features, folders.map, self.workers,
-            self.skip_existing, self.escalation, self.predictor,
+        scene_map = Map(
+            device, self.capture.path / "sessions", self.folders.map, self.settings, self.kinds, (), self.escalation,
+            self.folders.features, predictor=self.predictor,
         )  # fmt: skip
+        return scene_map.build(self.workers, self.skip_existing)
 
     def run(self, map_device: str, query_device: str) -> "_PairRun":
         """Open the map of a pair and the features of its queries."""

@@ -1,7 +1,7 @@
 """Probability that a pose is correct, that is, within 5 degrees and 0.5 m of the true pose.
 
 A logistic regression on statistics of the estimate. `benchmarks/confidence.py` fits the weights on rendered captures
-and on photographs that it darkens, blurs, fogs and half covers, and measures the calibration on held-out ones.
+and on real images that it darkens, blurs, fogs and half covers, and measures the calibration on held-out ones.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,7 +27,7 @@ WEIGHTS: dict[str, float] = {
     "log_agreement": 0.4397,
 }
 """Weights of the columns that `terms` returns, fitted by `benchmarks/confidence.py` on 2026-11-22 to 1,861 queries of
-rendered rooms and of photographs made hard; `benchmarks/README.md` lists them, and what a fit to others gives."""
+rendered rooms and of real images made hard; `benchmarks/README.md` lists them, and what a fit to others gives."""
 
 
 RIVAL_SLOPE = 10.7

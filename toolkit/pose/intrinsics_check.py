@@ -181,7 +181,8 @@ def _try_cameras(stated: "_Problem", start: "_Estimate", inliers: int) -> Misfit
             best = float(problem.inliers(fitted).sum())
             changes = np.array(list(map(_change, stated.query.cameras, cameras, fitted.parameters.reshape(-1, 4))))
             # If it is nearly the stated camera, the fit will tell.
-            sizes = _sizes(changes)
+            focal, right, down, distortion = changes.T  # and how far they move pixels, relatively
+            sizes = np.column_stack([np.abs(np.log1p(focal)), np.hypot(right, down), np.abs(distortion)])
             largest = np.where(sizes == sizes.max(axis=1, keepdims=True), 1.0, 0.0)
             misfit = Misfit(_motion(start, fitted), changes, largest) if sizes.max() > ABSURD else None
     return misfit
@@ -203,11 +204,6 @@ def _change(stated: pycolmap.Camera, other: pycolmap.Camera, parameters: Floats)
     distortion = float(np.nan_to_num(np.linalg.norm(seen - center) / (corner * focal_px) - 1, nan=-1.0))
     focal = other_px * (1 + parameters[0]) / focal_px - 1
     return np.array([focal, *((other_center - center) / focal_px), parameters[3] - distortion])
-
-
-def _sizes(changes: Floats) -> Floats:
-    """Return how far changes (C, 4) of focal length, principal point and distortion move pixels, relatively, (C, 3)."""
-    return np.column_stack([np.abs(np.log1p(changes[:, 0])), np.hypot(*changes[:, 1:3].T), np.abs(changes[:, 3])])
 
 
 def _motion(start: "_Estimate", end: "_Estimate") -> Floats:

@@ -84,7 +84,7 @@ class MappedFeatures:
         camera: int,
         kind: int,
         references: Sequence[int],
-        network_matches: NetworkMatches | None = None,
+        network_matches: NetworkMatches | None,
     ) -> list[tuple[Ints, Ints]]:
         """Match a query image with references.
 
@@ -290,29 +290,23 @@ class MapMatcher:
         self.map = LocalMap.pooled([features.map for features in mapped])
         """The map with the points of all kinds, one kind after the other."""
         self._first_point = np.cumsum([0, *(len(features.map.points) for features in mapped)])
-        self._index_in = [
-            None
-            if features.map.image_names is self.map.image_names
-            else [features.map.index_of.get(name, -1) for name in self.map.image_names]
-            for features in mapped
-        ]  # for each kind, the index of each image in that kind's map, -1 if it is not there; None: the same indices
 
     def by_descriptors(
         self,
         query: RigQuery,
         references: Sequence[References],
-        network_matches: Sequence[Sequence[NetworkMatches | None]] = (),
-        cache: MatchCache | None = None,
+        network_matches: Sequence[Sequence[NetworkMatches | None]],
+        cache: MatchCache,
     ) -> Matches:
         """Match each query image with its references by descriptors alone.
 
         Args:
             query: its cameras and features.
             references: references of each query image.
-            network_matches: matches that networks made earlier, for each query image and kind.
+            network_matches: matches that networks made earlier, for each query image and kind; empty if there are none.
             cache: earlier matches of this query; new ones are added.
         """
-        matches, cache = [], MatchCache() if cache is None else cache
+        matches = []
         for kind, features in enumerate(self.mapped):
             columns = [np.zeros((3, 0), np.int64)]
             for camera, retrieved in enumerate(references):
@@ -366,7 +360,7 @@ class MapMatcher:
 
     def _of_kind(self, kind: int, images: Ints | Sequence[int]) -> list[int]:
         """Return the indices of images in the map of one kind; images that it does not have are left out."""
-        index_in = self._index_in[kind]
-        if index_in is None:
+        of_kind, names = self.mapped[kind].map, self.map.image_names
+        if of_kind.image_names is names:
             return [int(image) for image in images]
-        return [index for image in images if (index := index_in[int(image)]) >= 0]
+        return [of_kind.index_of[names[image]] for image in images if names[image] in of_kind.index_of]

@@ -104,38 +104,25 @@ class Map:
     predictor: Predictor | None = None
     """Network of `feed_forward` and `hybrid`; None: opened as the settings say."""
 
-    @classmethod
-    def build(
-        cls,
-        capture: Capture,
-        device: str,
-        settings: LocalizeSettings,
-        kinds: Sequence[LocalMethod],
-        features_dir: Path,
-        map_dir: Path,
-        workers: int = 1,
-        skip_existing: bool = True,
-        escalation: Sequence[DeferredMethod] = (),
-        predictor: Predictor | None = None,
-    ) -> "Map":
-        """Extract the features of a map session and triangulate its points, or load existing ones."""
-        session, mapped = capture[f"{device}_map"], list[MappedFeatures]()
-        root = capture.path / "sessions"
-        scene_map = cls(device, root, map_dir, settings, kinds, mapped, escalation, features_dir, predictor=predictor)
-        for kind in kinds if settings.map is not None else ():
-            turns = scene_map.turns_of(kind, session)
-            store = extract_session(session, features_dir, kind.extractor, workers=workers, turns=turns)
-            inputs = fingerprint([session_fingerprint(session), store.fingerprint])
-            path = map_path(map_dir, session.id, kind.name)
+    def build(self, workers: int = 1, skip_existing: bool = True) -> "Map":
+        """Extract features of the map session and triangulate points, or load them; return the map with them."""
+        mapped, settings = list[MappedFeatures](), self.settings
+        built = replace(self, mapped=mapped)
+        session = built.session
+        for kind in self.kinds if settings.map is not None else ():
             assert settings.map is not None
+            assert self.features_dir is not None
+            turns = built.turns_of(kind, session)
+            store = extract_session(session, self.features_dir, kind.extractor, workers=workers, turns=turns)
+            inputs = fingerprint([session_fingerprint(session), store.fingerprint])
             local_map = build_map(
-                session, store, path, settings.map, settings.seed, skip_existing, inputs, workers,
-                settings.unit is not None, scene_map.refined_poses or None,
+                session, store, map_path(self.map_dir, session.id, kind.name), settings.map, settings.seed,
+                skip_existing, inputs, workers, settings.unit is not None, built.refined_poses or None,
             )  # fmt: skip
             mapped.append(MappedFeatures(local_map, store, kind.name, kind.matcher))
-        if scene_map.remarks:
-            log.warning("%s: %s", session.id, scene_map.remarks)
-        return scene_map
+        if built.remarks:
+            log.warning("%s: %s", session.id, built.remarks)
+        return built
 
     @classmethod
     def open(cls, run: str | Path, scene: str, device: str) -> "Map":
@@ -195,15 +182,7 @@ class Map:
 
     # The way of an image
 
-    def query(
-        self,
-        image: Image | Sequence[Image],
-        camera: pycolmap.Camera | Sequence[pycolmap.Camera],
-        rig_from_cams: NDArray[np.float64] | None = None,
-        turns: Sequence[int] | None = None,
-    ) -> Query:
-        """Return a query of any images with cameras; see `scene.query.query_from`."""
-        return query_from(image, camera, rig_from_cams, turns)
+    query = staticmethod(query_from)
 
     def query_of_session(self, session: Session, rows: Ints) -> Query:
         """Return a query of images that one device took at one instant, given by their rows in a session."""

@@ -67,12 +67,11 @@ class Run:
         Raises:
             ArtifactError: a table is damaged.
         """
-        keys, tables = ("scene", "map_device", "query_device"), list[pd.DataFrame]()
+        keys, tables = ["scene", "map_device", "query_device"], dict[tuple[str, ...], pd.DataFrame]()
         for scene in self.scenes:
             for path in pairs_of(SceneFiles(self.path, scene).poses_dir):
                 results = PairResults.open(path)
-                table = results.table.copy()
-                for column, value in enumerate((scene, *results.devices)):
-                    table.insert(column, keys[column], value)
-                tables.append(table)
-        return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=[*keys, "status"])
+                tables[scene, *results.devices] = results.table
+        if not tables:
+            return pd.DataFrame(columns=[*keys, "status"])
+        return pd.concat(tables, names=keys).reset_index(keys).reset_index(drop=True)
