@@ -58,13 +58,10 @@ class PosedImages:
             length: positions are divided by it.
             refined: poses (4, 4) by image name, instead of those of the session.
         """
+        rows = session.camera_rows if names is None else np.array([session.row_of_name[name] for name in names], int)
         if names is None:
-            rows = session.camera_rows
             rows = rows[np.isfinite(session.world_from_cam(rows)).reshape(-1, 16).all(axis=1)]
-            names = [session.image_name(int(row)) for row in rows]
-        else:
-            rows = np.array([session.row_of_name[name] for name in names], np.int64)
-        poses = session.world_from_cam(rows)
+        names, poses = [session.image_name(int(row)) for row in rows], session.world_from_cam(rows)
         poses = np.array([refined.get(name, pose) for name, pose in zip(names, poses, strict=True)]).reshape(-1, 4, 4)
         poses[:, :3, 3] /= length
         return cls(names, session.cameras(rows), poses, instants(session, rows))
