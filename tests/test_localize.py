@@ -1141,10 +1141,11 @@ def test_a_picture_has_the_references_of_a_run_with_several_descriptors(
     folders = (run.embeddings / name / "ios_query" for name in ("thumbnail", "vlad"))
     stored, tables = zip(*map(load_embeddings, folders), strict=True)
     as_run = place.search.embed_settings
-    answers, localize = [], place.localizer.localize
+    answers, localizer = [], place.localizer
     place.localizer = SimpleNamespace(  # type: ignore[misc, assignment]
-        localize=lambda query, references: answers.append(references) or localize(query, references),
-        image_names=place.localizer.image_names,
+        match=lambda query, references: answers.append(references) or localizer.match(query, references),
+        solve=localizer.solve,
+        image_names=localizer.image_names,
     )
     rows = {image_name(row["path"]): row["topk"] for row in read_references(run.retrieval("ios", "ios"))}
     for line, of_query in zip(
