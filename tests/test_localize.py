@@ -252,10 +252,11 @@ def test_wrong_questions_are_refused(
 
 def test_a_pose_without_covariance_leaves_the_others_theirs(tmp_path: Path) -> None:
     covariances = np.eye(6), np.full((6, 6), np.nan)
-    rows = [({"timestamp": time, "device_id": "a"}, np.eye(4), covariances[time]) for time in (0, 1)]
-    pair = SimpleNamespace(file=lambda suffix: tmp_path / f"pair.{suffix}")
-    localize._write_poses(pair, rows, LocalizeSettings())  # type: ignore[arg-type]
-    np.testing.assert_array_equal(Trajectory.read(pair.file("txt")).covariances, [np.eye(6), np.full((6, 6), np.nan)])
+    row = {"device_id": "a", "world_from_rig": np.eye(4)}
+    rows = [row | {"timestamp": time, "covariance": covariances[time]} for time in (0, 1)]
+    localize._write_poses(tmp_path / "pair.txt", rows, LocalizeSettings())
+    written = Trajectory.read(tmp_path / "pair.txt").covariances
+    np.testing.assert_array_equal(written, [np.eye(6), np.full((6, 6), np.nan)])
 
 
 def test_a_map_of_an_older_format_is_built_anew(small_capture: Path, run: SceneFiles) -> None:

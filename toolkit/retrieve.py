@@ -23,7 +23,7 @@ from toolkit.embedders.index import EXACT, is_index_current, make_index
 from toolkit.embedders.search import Backend, Found, search
 from toolkit.embedders.stored import matrix_fingerprints, require_same_embedder
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
-from toolkit.files import file_fingerprint, fingerprint, is_current, pair_name, write_atomic, write_sidecar, write_text
+from toolkit.files import file_fingerprint, fingerprint, is_current, pair_name, write_atomic, write_sidecar
 from toolkit.geometry import Ints
 from toolkit.manifest import MaskSettings, RetrieveSettings
 from toolkit.runs.pairs import PairRows
@@ -142,9 +142,7 @@ def retrieve_pairs(
                 _write_pair(path, query, database, found.pop(device))
                 write_sidecar(path, record, made_from=_matrices(query.session, database.session, embeddings=embeddings))
                 row["seconds"] = round(shared + time.perf_counter() - started, 3)
-    frame = table.frame()
-    write_text(folder / "settings.json", settings.model_dump_json(indent=1) + "\n")
-    return frame
+    return table.frame(settings)
 
 
 @dataclass(frozen=True)

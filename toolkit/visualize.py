@@ -1,7 +1,6 @@
 """The visualize stage: recordings and still pictures of a scene, from the files of earlier stages."""
 
 import re
-import time
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import product
@@ -89,7 +88,6 @@ def visualize_scene(
         _remove_pictures(out, name)  # those of an earlier run would look like results of this one
         with table.row(m, q) as row:
             table.check_upstream()
-            started = time.perf_counter()
             of_pair = _poses(capture, poses_dir, m, q)
             require_current(of_pair, "localize", (".npz",), missing=False)
             pair = LocalizedPair.open(capture, m, q, poses_dir, map_dir)
@@ -101,7 +99,6 @@ def visualize_scene(
             row |= {
                 "queries": len(pair.results.table),
                 "localized": int(is_posed(pair.results.poses).sum()),
-                "seconds": round(time.perf_counter() - started, 3),
                 "still": str(out / f"{pair.name}.png"),
                 "recording": str(out / f"{pair.name}.rrd") if settings.recordings else "",
             }
