@@ -123,25 +123,21 @@ def retrieve_pairs(
                     _require_same_dimension(query, database)
                     require_same_embedder(query.vectors, database.vectors)
                     todo[device] = replace(query, masks=masks), path, record
-                row |= query.counts | database.counts | without
-                row |= {"seconds": 0.0, "skipped": skipped, "path": str(path)}
+                row |= query.counts | database.counts | without | {"skipped": skipped, "path": str(path)}
         if not todo:
             continue
         found: dict[str, Found] = {}
         started = time.perf_counter()
-        find = partial(
-            _search, database=database, settings=settings, embeddings=embeddings, skip_existing=skip_existing
-        )
+        find = partial(_search, database=database, settings=settings, embeddings=embeddings, again=not skip_existing)
         with suppress(ArtifactError):  # a value is not finite: search pair by pair, so that only its row fails
             found = find({device: query for device, (query, _, _) in todo.items()})
         shared = (time.perf_counter() - started) / len(todo)
         for device, (query, path, record) in todo.items():
             with table.row(map_device, device) as row:
-                started = time.perf_counter()
                 found = found or find({device: query})
                 _write_pair(path, query, database, found.pop(device))
                 write_sidecar(path, record, made_from=_matrices(query.session, database.session, embeddings=embeddings))
-                row["seconds"] = round(shared + time.perf_counter() - started, 3)
+                row["seconds"] += shared
     return table.frame(settings)
 
 
@@ -218,7 +214,7 @@ def _require_same_dimension(query: _Images, database: _Images) -> None:
 
 
 def _search(
-    queries: Mapping[str, _Images], database: _Images, settings: RetrieveSettings, embeddings: Path, skip_existing: bool
+    queries: Mapping[str, _Images], database: _Images, settings: RetrieveSettings, embeddings: Path, again: bool
 ) -> dict[str, Found]:
     """Return the best map images of several sets of queries, with one pass over the map.
 
@@ -229,7 +225,7 @@ def _search(
     backend: Backend = "faiss" if settings.use_faiss else "torch"
     masks = [query.masks for query in queries.values() if query.masks is not None]
     try:
-        index = make_index(embeddings, database.session.id, database.vectors, settings, skip_existing)
+        index = make_index(embeddings, database.session.id, database.vectors, settings, not again)
         found = search(
             stacked, database.vectors, settings.topk, backend, settings.compute_device, settings.faiss_gpu, index,
             Masks.stack(masks) if masks else None, database.vectors.dims,
@@ -304,12 +300,11 @@ def _masks(
     if not priors:
         return None, {}
     masks, counts = combine(list(priors.values()))
-    without = dict(zip(priors, counts, strict=True))
-    for prior, count in without.items():
+    for prior, count in zip(priors, counts, strict=True):
         if count:
             message = "map %s, query %s: %s leaves the whole map to %d of %d query images"
             log.warning(message, database.session.id, query.session.id, prior, count, len(masks))
-    return masks, {f"without_{prior}": count for prior, count in without.items()}
+    return masks, {f"without_{prior}": count for prior, count in zip(priors, counts, strict=True)}
 
 
 def _mask_record(settings: MaskSettings, *sessions: Session) -> dict[str, Any]:
