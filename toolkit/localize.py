@@ -437,11 +437,12 @@ class _Pair:
         faulty = dict[int, QueryResult]()
         of_number = {number: (name, source) for name, source, number in todo}
         firsts = {} if retry_s is None else {one[2]: self._first(items, one) for one in todo}
-        tasks, locate = self._predicted(list(of_number)), self._locate
-        if retry_s is not None:
+        if retry_s is None:
+            results = self._run(self._locate, self._predicted(list(of_number)), len(todo))
+        else:
             tasks = ((number, self.query(number), firsts[number], retry_s) for number in of_number)
-            locate = self.map.retry
-        for number, result in self._run(locate, tasks, len(todo)):
+            results = self._run(self.map.retry, tasks, len(todo))
+        for number, result in results:
             if result.is_internal:
                 faulty[number] = result
             else:

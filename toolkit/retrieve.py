@@ -78,8 +78,8 @@ def retrieve_pairs(
         that it leaves the whole map.
 
     Raises:
-        ToolkitError: unknown device; or all pairs fail: there is no such list, embeddings are missing or have
-            different dimensions. The message says which.
+        ToolkitError: unknown device; the file of `mask.poses` is missing or malformed; or all pairs fail: there is no
+            such list, embeddings are missing or have different dimensions. The message says which.
     """
     settings = RetrieveSettings.of(settings)
     capture = Capture.from_sessions_root(sessions_root)
@@ -90,7 +90,7 @@ def retrieve_pairs(
         raise ManifestError(f"out_jsonl is one file ({out}) for {len(chosen)} pairs; give a folder.")
     folder = out.parent if out.suffix == ".jsonl" else out
     table = PairRows(capture.name, folder)
-    poses = _rough_poses(settings.mask)
+    poses = None if settings.mask.poses is None else Trajectory.read(settings.mask.poses)
 
     @cache
     def load_queries(device: str) -> _Images:
@@ -270,17 +270,6 @@ def _matrices(*sessions: Session, embeddings: Path) -> list[Path]:
     """Return the files of the sessions' embeddings."""
     folders = [folder / session.id for session in sessions for folder in embedding_folders(embeddings).values()]
     return [path for folder in folders for path in sorted(folder.rglob("*.npy"))]
-
-
-def _rough_poses(settings: MaskSettings) -> Trajectory | None:
-    if settings.poses is None:
-        return None
-    if not Path(settings.poses).is_file():
-        raise ManifestError(
-            f"retrieve.mask.poses: no such file: {settings.poses}. Expected poses of query devices in the map's frame, "
-            "in the format of trajectories.txt."
-        )
-    return Trajectory.read(settings.poses)
 
 
 def _masks(
