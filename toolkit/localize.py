@@ -264,7 +264,7 @@ class _Pair:
     def record(self) -> dict[str, Any]:
         """Return everything that the poses of the pair depend on."""
         stage, map_session = self.stage, self.stage.capture[f"{self.devices[0]}_map"]
-        settings, sessions = stage.settings, [map_session, self.session]
+        settings, sessions, keyframes = stage.settings, [map_session, self.session], self.keyframes
         if not self.retrieval.exists():
             read_references(self.retrieval)  # raises an error that names the missing file
         record: dict[str, Any] = {
@@ -279,7 +279,7 @@ class _Pair:
             "map_session": session_fingerprint(map_session),
             "query_session": session_fingerprint(self.session),
             "images": [session.files_fingerprint for session in sessions],
-            "keyframes": fingerprint([[str(timestamp) for timestamp, _ in self.keys], [key[1] for key in self.keys]]),
+            "keyframes": fingerprint([keyframes["timestamp"].astype(str).tolist(), keyframes["device_id"].tolist()]),
         }
         if stage.escalation:
             record["escalation"] = {
