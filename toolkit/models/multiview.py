@@ -21,7 +21,7 @@ from toolkit.capture.images import HEADER_ERRORS, open_lazily, read_file
 from toolkit.errors import ImageError
 from toolkit.geometry import Floats, Ints, quaternion_to_rotation
 from toolkit.models.vit import PATCH, Block
-from toolkit.models.weights import checkpoint_tensors, load_checkpoint
+from toolkit.models.weights import load_checkpoint, read_state_dict
 
 Source = str | Path | Image.Image | NDArray[np.uint8]
 """A path, a Pillow image, or an array (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) gray, uint8."""
@@ -222,7 +222,8 @@ class MultiView(nn.Module):
             WeightsError: no checkpoint, or one of another model; names missing, unexpected, mis-shaped keys.
             ValueError: unknown head.
         """
-        where, state = checkpoint_tensors(checkpoint)
+        where = "" if isinstance(checkpoint, Mapping) else str(checkpoint)
+        state = read_state_dict(checkpoint)
         with torch.device("meta"):
             model = cls(cls.known_heads if heads is None else heads, compute_dtype, **cls._sizes(state))
         other_heads = (prefix for head, prefix in cls.prefixes.items() if head not in model.heads)
