@@ -179,8 +179,8 @@ def create(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Create:
         monkeypatch.setattr(
             ROWS[name].network, "from_checkpoint", lambda _, heads, compute_dtype: small(heads, compute_dtype)
         )
-        if hasattr(ARCHITECTURES[name], "_channels"):
-            monkeypatch.setattr(ARCHITECTURES[name], "_channels", small().channels)
+        if ARCHITECTURES[name].channels:
+            monkeypatch.setattr(ARCHITECTURES[name], "channels", small().channels)
         checkpoint = tmp_path / "weights.pt"
         checkpoint.write_bytes(b"stands for weights")
         asked = {"name": name, "checkpoint": str(checkpoint), **options}
@@ -218,7 +218,7 @@ def test_other_rows(create: Create, photographs: Photographs, name: str, sizes: 
 
 def test_weights_of_the_other_size_are_refused(create: Create, photographs: Photographs) -> None:
     predictor = create("da3-base")
-    predictor._architecture._channels = 768  # type: ignore[attr-defined]
+    predictor._architecture.channels = 768
     with pytest.raises(WeightsError, match=r"weights\.pt: these are weights with 32 channels, not DA3-BASE.*768"):
         predictor.predict([photographs.group(WIDE, WIDE)])
 

@@ -9,14 +9,14 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from PIL import Image
 from torch import Tensor, nn
 
 from toolkit.geometry import Floats, invert, make_pose
 from toolkit.models import multiview
 from toolkit.models.dpt import ConvolutionalHead, LayerTokens, dense_output
-from toolkit.models.multiview import Fitted, MultiView, Source, Views, load_views, unproject_depth
+from toolkit.models.multiview import Fit, Loader, MultiView, Size, Source, Views, unproject_depth
 from toolkit.models.vit import PATCH, Dinov2, normalized, places_of_view, rope_of_places, set_matrix_type
 
 __all__ = ["HEADS", "MODES", "DepthAnything3", "Views", "cameras_from_pose_encoding", "load_images", "unproject_depth"]
@@ -43,31 +43,33 @@ def resized_sizes(width: int, height: int) -> tuple[tuple[int, int], tuple[int, 
     return first, (PATCH * columns, PATCH * rows)
 
 
+def _show(image: Image.Image, mode: str) -> Image.Image:
+    import cv2
+
+    pixels = np.asarray(image)
+    for size in resized_sizes(*image.size):
+        if pixels.shape[1::-1] != size:
+            grows = size[0] > pixels.shape[1] or size[1] > pixels.shape[0]
+            pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_CUBIC if grows else cv2.INTER_AREA)
+    return Image.fromarray(pixels)
+
+
+def _fit(size: Size, mode: str) -> Fit:
+    resized = resized_sizes(*size)[1]
+    return resized, np.divide(resized, size), (0.0, 0.0)
+
+
+LOADER = Loader(MODES, _fit, _show, crops=True)
+
+
 def load_images(sources: Sequence[Source], mode: str = "upper_bound_resize") -> Views:
-    """Load images as the official loader does; see `multiview.load_views`.
+    """Load images as the official loader does; see `multiview.Loader.load`.
 
     Resizes the longer side to 504 pixels, then both sides to the nearest multiples of 14 (by OpenCV, with area
     interpolation if the image shrinks, else bicubic). Crops images of different sizes at their center to the smallest
     width and height among them. Transparent pixels become white; the official loader keeps their hidden color.
     """
-
-    def fit(image: Image.Image) -> Fitted | None:
-        first, second = resized_sizes(*image.size)
-        if not min(second):
-            return None
-        resized = Image.fromarray(_resize(_resize(np.asarray(image), first), second))
-        return resized, np.divide(second, image.size), (0.0, 0.0)
-
-    return load_views(sources, mode, MODES, fit, crop=True)
-
-
-def _resize(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    import cv2
-
-    if image.shape[1::-1] == size:
-        return image
-    grows = size[0] > image.shape[1] or size[1] > image.shape[0]
-    return cast(NDArray[np.uint8], cv2.resize(image, size, interpolation=cv2.INTER_CUBIC if grows else cv2.INTER_AREA))
+    return LOADER.load(sources, mode)
 
 
 def cameras_from_pose_encoding(pose_enc: ArrayLike, size: tuple[int, int]) -> tuple[Floats, Floats]:

@@ -16,6 +16,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from toolkit.capture.images import HEADER_ERRORS, open_lazily, read_file
 from toolkit.errors import ImageError
@@ -25,8 +26,26 @@ from toolkit.models.weights import load_checkpoint, read_state_dict
 
 Source = str | Path | Image.Image | NDArray[np.uint8]
 """A path, a Pillow image, or an array (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) gray, uint8."""
-Fitted = tuple[Image.Image, ArrayLike, ArrayLike]
-"""A resized and cropped RGB image, and the scale and offset (x, y) that map original pixels to its pixels."""
+Size = tuple[int, int]
+"""Width and height, or (H, W) where it says so, pixels."""
+Fit = tuple[Size, ArrayLike, ArrayLike]
+"""Size (width, height) of an image that is resized and cropped for a network, and the scale and offset (x, y) that map
+original pixels to its pixels."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Places of the images of a group in the network images, which have one size."""
+
+    mode: str
+    """Mode of the loader."""
+    size: Size
+    """(H, W) of the network images."""
+    scale: Floats
+    """(S, 2) scale of x and y. The point (x, y) of image i maps to scale[i] * (x, y) + offset[i]; the center of the
+    top-left pixel is (0.5, 0.5) in both."""
+    offset: Floats
+    """(S, 2) in pixels of the network images."""
 
 
 @dataclass(frozen=True)
@@ -46,61 +65,69 @@ class Views:
     """(S, 2): width and height of the original images."""
 
 
-def load_views(
-    sources: Sequence[Source],
-    mode: str,
-    modes: Sequence[str],
-    fit: Callable[[Image.Image], Fitted | None],
-    least: tuple[int, int] = (0, 0),
-    crop: bool = False,
-) -> Views:
-    """Load images, fit each to the network, and center them on white canvases of one size.
+@dataclass(frozen=True)
+class Loader:
+    """Loads images as the official loader of a network does, and tells where it places them."""
 
-    Blends RGBA with white, as the official loaders do. Does not apply the EXIF orientation. An odd border is one pixel
-    narrower at the left and top.
+    modes: tuple[str, ...]
+    fit: Callable[[Size, str], Fit]
+    """Returns how an image of this (width, height) is resized and cropped in a mode; a side of 0: too elongated."""
+    show: Callable[[Image.Image, str], Image.Image]
+    """Resizes and crops an RGB image accordingly."""
+    least: Callable[[str], Size] = lambda mode: (0, 0)
+    """Returns the smallest (width, height) of the network images in a mode."""
+    crops: bool = False
+    """Whether images of different sizes are cropped at their center to the smallest width and height among them. Else
+    they get white borders up to the largest; an odd border is one pixel narrower at the left and top."""
 
-    Args:
-        sources: the images.
-        mode, modes: the mode of `fit`, and those that it knows.
-        fit: resizes and crops an RGB image; None if its shorter side would shrink to nothing.
-        least: smallest (W, H) of the canvases.
-        crop: crop the fitted images at their center to the smallest width and height, instead of adding borders.
+    def lay_out(self, sizes: Sequence[Size], mode: str) -> Layout:
+        """Return the layout of images of these sizes (width, height), at least one."""
+        fitted, scales, offsets = (
+            np.array(values) for values in zip(*(self.fit(size, mode) for size in sizes), strict=True)
+        )
+        if self.crops:
+            width, height = fitted.min(axis=0).tolist()
+            borders = -((fitted - [width, height]) // 2)
+        else:
+            width, height = np.maximum(fitted.max(axis=0), self.least(mode)).tolist()
+            borders = ([width, height] - fitted) // 2
+        return Layout(mode, (height, width), scales, offsets + borders)
 
-    Raises:
-        ImageError: a file is missing or cannot be decoded, or an image is too elongated.
-        ValueError: no images, or an unknown mode.
-    """
-    if mode not in modes:
-        raise ValueError(f"mode is {mode!r}; expected one of {list(modes)}.")
-    if not len(sources):
-        raise ValueError("found no images; expected at least one.")
-    shown, sizes = list[Fitted](), list[tuple[int, int]]()
-    for position, source in enumerate(sources):
-        image = _open_image(source)
-        fitted = fit(image)
-        if fitted is None:
-            where = source if isinstance(source, str | Path) else f"no. {position}"
-            raise ImageError(
-                f"Image of {image.width} x {image.height} pixels is too elongated for the network: {where}. Its "
-                f"shorter side would be less than half a patch of {PATCH} pixels; crop it."
-            )
-        shown.append(fitted)
-        sizes.append(image.size)
-    pixels: list[Image.Image]
-    pixels, scales, offsets = (list(values) for values in zip(*shown, strict=True))
-    shapes = np.array([image.size for image in pixels])
-    width, height = shapes.min(axis=0) if crop else np.maximum(shapes.max(axis=0), least)
-    if crop:
-        borders = -((shapes - [width, height]) // 2)
-        pixels = [image.crop((-x, -y, width - x, height - y)) for image, (x, y) in zip(pixels, borders, strict=True)]
-    else:
-        borders = ([width, height] - shapes) // 2
-    images = torch.ones(len(pixels), 3, height, width)
-    for canvas, image, corner in zip(images, pixels, borders, strict=True):
-        left, top = np.maximum(corner, 0)
-        tensor = torch.from_numpy(np.array(image)).permute(2, 0, 1)
-        canvas[:, top : top + image.height, left : left + image.width] = tensor.float() / 255
-    return Views(images, np.array(scales), np.array(offsets) + borders, np.array(sizes, np.int64))
+    def load(self, sources: Sequence[Source], mode: str) -> Views:
+        """Load images. Blends RGBA with white. Does not apply the EXIF orientation.
+
+        Raises:
+            ImageError: a file is missing or cannot be decoded, or an image is too elongated.
+            ValueError: no images, or an unknown mode.
+        """
+        if mode not in self.modes:
+            raise ValueError(f"mode is {mode!r}; expected one of {list(self.modes)}.")
+        if not len(sources):
+            raise ValueError("found no images; expected at least one.")
+        shown, sizes = [], []
+        for position, source in enumerate(sources):
+            image = _open_image(source)
+            if not min(self.fit(image.size, mode)[0]):
+                where = source if isinstance(source, str | Path) else f"no. {position}"
+                raise ImageError(
+                    f"Image of {image.width} x {image.height} pixels is too elongated for the network: {where}. Its "
+                    f"shorter side would be less than half a patch of {PATCH} pixels; crop it."
+                )
+            shown.append(self.show(image, mode))
+            sizes.append(image.size)
+        layout = self.lay_out(sizes, mode)
+        height, width = layout.size
+        images = torch.ones(len(shown), 3, height, width)
+        for canvas, image in zip(images, shown, strict=True):
+            canvas[:] = centered(torch.from_numpy(np.array(image)).permute(2, 0, 1).float() / 255, layout.size)
+        return Views(images, layout.scale, layout.offset, np.array(sizes, np.int64))
+
+
+def centered(image: Tensor, size: Size) -> Tensor:
+    """Return an image (3, h, w) with a white border, or cropped, to this (H, W)."""
+    down, right = (all_ - own for all_, own in zip(size, image.shape[1:], strict=True))
+    top, left = int(down / 2), int(right / 2)  # negative where the image is cropped
+    return F.pad(image, (left, right - left, top, down - top), value=1.0)
 
 
 def _open_image(source: Source) -> Image.Image:

@@ -15,12 +15,13 @@ from torch import Tensor, nn
 
 from toolkit.models.dpt import DenseHead, LayerTokens, add_position, dense_output
 from toolkit.models.multiview import (
-    Fitted,
+    Fit,
+    Loader,
     MultiView,
+    Size,
     Source,
     Views,
     cameras_from_pose_encoding,
-    load_views,
     unproject_depth,
     with_special_tokens,
 )
@@ -59,22 +60,30 @@ def resized_size(width: int, height: int, mode: str) -> tuple[int, int]:
     return SIDE, PATCH * round(SIDE * aspect / PATCH)
 
 
+def _fit(size: Size, mode: str) -> Fit:
+    cropped = cropped_size(*size)
+    resized = resized_size(*cropped, mode)
+    scale = np.divide(resized, cropped)
+    return resized, scale, -scale * (np.subtract(size, cropped) // 2)
+
+
+def _show(image: Image.Image, mode: str) -> Image.Image:
+    width, height = cropped_size(*image.size)
+    left, top = (image.width - width) // 2, (image.height - height) // 2
+    cropped = image.crop((left, top, left + width, top + height))
+    return cropped.resize(resized_size(width, height, mode), Image.Resampling.BICUBIC)
+
+
+LOADER = Loader(MODES, _fit, _show)
+
+
 def load_images(sources: Sequence[Source], mode: str = "balanced") -> Views:
-    """Load images as the official loader does; see `multiview.load_views`.
+    """Load images as the official loader does; see `multiview.Loader.load`.
 
     Crops images of more than 2 to 1 at their center. Resizes images (bicubic, by Pillow) in proportion, rounded to
     multiples of 16: "balanced" to about the area of 512 x 512 pixels; "max_size" to a longer side of 512 pixels.
     """
-
-    def fit(image: Image.Image) -> Fitted:
-        width, height = cropped_size(*image.size)
-        left, top = (image.width - width) // 2, (image.height - height) // 2
-        size = resized_size(width, height, mode)
-        scale = np.divide(size, (width, height))
-        shown = image.crop((left, top, left + width, top + height)).resize(size, Image.Resampling.BICUBIC)
-        return shown, scale, -scale * (left, top)
-
-    return load_views(sources, mode, MODES, fit)
+    return LOADER.load(sources, mode)
 
 
 class PlaceRope(nn.Module):

@@ -14,12 +14,13 @@ from torch import Tensor, nn
 
 from toolkit.models.dpt import ConvolutionalHead, LayerTokens, dense_output
 from toolkit.models.multiview import (
-    Fitted,
+    Fit,
+    Loader,
     MultiView,
+    Size,
     Source,
     Views,
     cameras_from_pose_encoding,
-    load_views,
     unproject_depth,
     with_special_tokens,
 )
@@ -57,23 +58,33 @@ def resized_size(width: int, height: int, mode: str) -> tuple[int, int]:
     return new_width, new_height
 
 
+def _cut(height: int, mode: str) -> int:
+    """Return the number of rows that "crop" cuts at the top of a resized image."""
+    return max(0, (height - SIDE) // 2) if mode == "crop" else 0
+
+
+def _fit(size: Size, mode: str) -> Fit:
+    width, height = resized_size(*size, mode)
+    return (width, min(height, SIDE)), np.divide((width, height), size), (0.0, -_cut(height, mode))
+
+
+def _show(image: Image.Image, mode: str) -> Image.Image:
+    width, height = resized_size(*image.size, mode)
+    top = _cut(height, mode)
+    resized = image.resize((width, height), Image.Resampling.BICUBIC)
+    return resized.crop((0, top, width, min(top + SIDE, height)))
+
+
+LOADER = Loader(MODES, _fit, _show, least=lambda mode: (SIDE, SIDE if mode == "pad" else 0))
+
+
 def load_images(sources: Sequence[Source], mode: str = "crop") -> Views:
-    """Load images as the official loader does; see `multiview.load_views`.
+    """Load images as the official loader does; see `multiview.Loader.load`.
 
     Resizes images (bicubic, by Pillow) in proportion, to multiples of 14: "crop" makes the width 518 and keeps at most
     the 518 middle rows; "pad" makes the longer side 518 and adds white up to 518 x 518.
     """
-
-    def fit(image: Image.Image) -> Fitted | None:
-        width, height = resized_size(*image.size, mode)
-        if not min(width, height):
-            return None
-        top = max(0, (height - SIDE) // 2) if mode == "crop" else 0
-        resized = image.resize((width, height), Image.Resampling.BICUBIC)
-        shown = resized.crop((0, top, width, min(top + SIDE, height)))
-        return shown, np.divide((width, height), image.size), (0.0, -top)
-
-    return load_views(sources, mode, MODES, fit, (SIDE, SIDE if mode == "pad" else 0))
+    return LOADER.load(sources, mode)
 
 
 class PatchEncoder(Dinov2):

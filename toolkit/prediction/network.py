@@ -146,7 +146,7 @@ class NetworkPredictor:
             WeightsError: at the first call, the file does not belong to this network.
             ToolkitError: the device does not exist, or its memory does not hold a query and one reference.
         """
-        placed = [self._place(group) for group in groups]
+        placed = [self._place(group) if group else [] for group in groups]
         results = [_nothing(len(group)) for group in groups]
         alike: dict[tuple[int, Size], list[int]] = {}
         for number, group in enumerate(placed):
@@ -332,7 +332,7 @@ def _compile(network: Any, architecture: Architecture, device: "torch.device") -
     import torch
 
     network.compile_blocks()
-    side = 2 * architecture.patch
+    side = 2 * network.patch
     try:
         with torch.inference_mode():
             network(torch.zeros(1, _LEAST_VIEWS, 3, side, side, device=device), ("camera",))
