@@ -5,6 +5,7 @@ under the Apache License 2.0.
 """
 
 from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -18,6 +19,7 @@ from toolkit.models import multiview
 from toolkit.models.dpt import ConvolutionalHead, LayerTokens, dense_output
 from toolkit.models.multiview import Fit, Loader, MultiView, Size, Source, Views, unproject_depth
 from toolkit.models.vit import PATCH, Dinov2, normalized, places_of_view, rope_of_places, set_matrix_type
+from toolkit.models.weights import read_state_dict
 
 __all__ = ["HEADS", "MODES", "DepthAnything3", "Views", "cameras_from_pose_encoding", "load_images", "unproject_depth"]
 
@@ -253,8 +255,8 @@ class DepthAnything3(MultiView):
             self.head = ConvolutionalHead(2 * dim, 2, dense_channels, dense_features, overwrites=False)
 
     @classmethod
-    def _sizes(cls, state: Mapping[str, Tensor]) -> dict[str, Any]:
-        token = state.get("backbone.pretrained.camera_token")
+    def _sizes(cls, checkpoint: str | Path | Mapping[str, Tensor]) -> dict[str, Any]:
+        token = read_state_dict(checkpoint).get("backbone.pretrained.camera_token")
         dim = 0 if token is None else token.shape[-1]
         if dim not in _SIZES:
             return {}  # another network: loading will raise the error

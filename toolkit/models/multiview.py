@@ -22,7 +22,7 @@ from toolkit.capture.images import HEADER_ERRORS, open_lazily, read_file
 from toolkit.errors import ImageError
 from toolkit.geometry import Floats, Ints, quaternion_to_rotation
 from toolkit.models.vit import PATCH, Block
-from toolkit.models.weights import load_checkpoint, read_state_dict
+from toolkit.models.weights import load_checkpoint
 
 Source = str | Path | Image.Image | NDArray[np.uint8]
 """A path, a Pillow image, or an array (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) gray, uint8."""
@@ -249,16 +249,14 @@ class MultiView(nn.Module):
             WeightsError: no checkpoint, or one of another model; names missing, unexpected, mis-shaped keys.
             ValueError: unknown head.
         """
-        where = "" if isinstance(checkpoint, Mapping) else str(checkpoint)
-        state = read_state_dict(checkpoint)
         with torch.device("meta"):
-            model = cls(cls.known_heads if heads is None else heads, compute_dtype, **cls._sizes(state))
+            model = cls(cls.known_heads if heads is None else heads, compute_dtype, **cls._sizes(checkpoint))
         other_heads = (prefix for head, prefix in cls.prefixes.items() if head not in model.heads)
-        load_checkpoint(model, state, cls.title, ignore=(*cls.unused, *other_heads), where=where)
+        load_checkpoint(model, checkpoint, cls.title, ignore=(*cls.unused, *other_heads))
         return model
 
     @classmethod
-    def _sizes(cls, state: Mapping[str, Tensor]) -> dict[str, Any]:
+    def _sizes(cls, checkpoint: str | Path | Mapping[str, Tensor]) -> dict[str, Any]:
         """Return the constructor arguments in which the official checkpoints differ."""
         return {}
 

@@ -302,7 +302,6 @@ def load_checkpoint(
     name: str = "",
     ignore: tuple[str, ...] = (),
     rename: "Callable[[Mapping[str, Tensor]], dict[str, Tensor]]" = dict,
-    where: str = "",
 ) -> None:
     """Load a checkpoint into a module and prepare it for inference: no gradients, evaluation mode.
 
@@ -316,7 +315,6 @@ def load_checkpoint(
         name: name of the network, for messages; empty: the module's class.
         ignore: prefixes of keys that the module does not need.
         rename: maps the other tensors to the module's names.
-        where: name of the file that the tensors are from, for messages.
 
     Raises:
         WeightsError: no checkpoint, or one of another network; lists the missing, unexpected, and mis-shaped or
@@ -325,7 +323,7 @@ def load_checkpoint(
     state = read_state_dict(checkpoint)
     state = rename({key: value for key, value in state.items() if not key.startswith(ignore)})
     expected: dict[str, Tensor] = module.state_dict()
-    where = where or ("the given dict" if isinstance(checkpoint, Mapping) else str(checkpoint))
+    where = "the given dict" if isinstance(checkpoint, Mapping) else str(checkpoint)
     # torch's own message names all keys, which may be thousands, and torch converts any type.
     faults = {
         "missing": [key for key in expected if key not in state],
