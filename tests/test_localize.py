@@ -46,7 +46,7 @@ from toolkit.pose.correspondences import LocalizedQueries
 from toolkit.pose.escalation import EscalatingLocalizer
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer
-from toolkit.prediction import registry as predictors
+from toolkit.prediction import network as predictors
 from toolkit.prediction.interface import Prediction
 from toolkit.prediction.simulated import SimulatedPredictor
 from toolkit.rerank import rerank_pairs

@@ -53,7 +53,7 @@ from toolkit.pose.intrinsics_check import MAX_SHARES, SIGNIFICANCE
 from toolkit.pose.pnp import PNP_FORMAT
 from toolkit.pose.stored_queries import localized_query, references_of_images, stored_query
 from toolkit.prediction.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
-from toolkit.prediction.registry import open_predictor
+from toolkit.prediction.network import open_predictor
 from toolkit.runs.pairs import PairRows
 from toolkit.scene.locate import localize_image
 from toolkit.scene.map import (

@@ -31,8 +31,7 @@ from toolkit.models.vggt import VGGT, cameras_from_pose_encoding, load_images
 from toolkit.pose.base import View
 from toolkit.prediction.architectures import ARCHITECTURES, PlacedView, shown_size
 from toolkit.prediction.interface import Prediction
-from toolkit.prediction.network import NetworkPredictor, TokenCache
-from toolkit.prediction.registry import open_predictor
+from toolkit.prediction.network import NetworkPredictor, TokenCache, open_predictor
 
 # In the network 518 x 112, 518 x 126 and 112 x 518 pixels.
 WIDE, HIGHER, PORTRAIT = (370, 80), (333, 81), (80, 370)

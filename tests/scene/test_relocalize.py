@@ -16,7 +16,7 @@ from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles
 from toolkit.manifest import LocalizeSettings
 from toolkit.pose.base import PoseEstimate
-from toolkit.prediction import registry as predictors
+from toolkit.prediction import network as predictors
 from toolkit.prediction.simulated import SimulatedPredictor
 from toolkit.scene import map as maps
 from toolkit.scene.map import Map

@@ -1,4 +1,4 @@
-"""A network as a predictor: batching of views, choice of device, and cache of encodings."""
+"""A network as a predictor: batching of views, choice of device, and cache of encodings. Opens predictors by name."""
 
 import logging
 from collections import OrderedDict
@@ -10,16 +10,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from toolkit.capture import Capture
 from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.capture.turning import turn_image, turned_from_cam
 from toolkit.errors import ImageError, ManifestError, ToolkitError, first_line
 from toolkit.files import files_fingerprint
 from toolkit.geometry import invert, make_pose
+from toolkit.manifest import LocalizeSettings
 from toolkit.models.compute import PRECISIONS, Fitting, on_device, resolve_device, resolve_precision
 from toolkit.models.weights import resolve_weights
 from toolkit.pose.base import View
 from toolkit.prediction.architectures import ARCHITECTURES, HEADS, Architecture, PlacedView, Size, shown_size
-from toolkit.prediction.interface import Prediction
+from toolkit.prediction.interface import Prediction, Predictor
+from toolkit.prediction.simulated import SimulatedPredictor
 
 if TYPE_CHECKING:
     import torch
@@ -34,19 +37,38 @@ _IMAGES_AT_A_TIME = 8
 _LEAST_VIEWS = 2  # the query and one reference
 
 
+def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) -> Predictor:
+    """Return the predictor of the settings. Warn about the simulated one, which uses the ground truth.
+
+    Raises:
+        ManifestError: the device or the precision does not exist.
+        WeightsError: the weights are missing; the message says how to get them.
+    """
+    predictor = settings.predictor
+    if predictor.name != "simulated":
+        return NetworkPredictor(
+            predictor.checkpoint,
+            settings.compute_device,
+            settings.dtype_compute,
+            architecture=ARCHITECTURES[predictor.name],
+            compile=predictor.compile,
+        )
+    log.warning("predictor: simulated looks up the true poses of the queries. Its poses are no results.")
+    sessions = [*capture.usable("map"), *capture.usable("query")]
+    return SimulatedPredictor(sessions, map_dir, settings.features.kinds[0], seed=settings.seed)
+
+
 class TokenCache:
     """Least recently used cache of encodings of map images. Not thread-safe."""
 
     def __init__(self, max_bytes: int) -> None:
-        self.max_bytes = max_bytes
-        self.bytes = 0
+        self.max_bytes, self.bytes = max_bytes, 0
         self._kept: OrderedDict[Any, Tensor] = OrderedDict()
 
     def __contains__(self, key: Any) -> bool:
         return key in self._kept
 
     def get(self, key: Any) -> "Tensor | None":
-        """Return the encoding of a key, or None."""
         if key in self._kept:
             self._kept.move_to_end(key)
         return self._kept.get(key)

@@ -50,7 +50,7 @@ from toolkit.pose.pnp import PnpLocalizer
 from toolkit.prediction.feed_forward import FeedForwardLocalizer
 from toolkit.prediction.hybrid import HybridLocalizer
 from toolkit.prediction.interface import Predictor
-from toolkit.prediction.registry import open_predictor
+from toolkit.prediction.network import open_predictor
 from toolkit.runs.record import RECORD
 from toolkit.store.hdf5 import HDF5_ERRORS
 
