@@ -111,7 +111,8 @@ class Architecture:
     def lay_out(self, sizes: Sequence[Size]) -> "Layout":
         """Return the layout of images of these sizes (width, height), at least one."""
         portrait = any(height > width for width, height in sizes)
-        layout: Layout = self._imported.LOADER.lay_out(sizes, (self.portrait_mode if portrait else "") or self.mode)
+        mode = self.portrait_mode if portrait and self.portrait_mode else self.mode
+        layout: Layout = self._imported.LOADER.lay_out(sizes, mode)
         return layout
 
     def load(self, checkpoint: Path, dtype: "torch.dtype") -> Any:
