@@ -25,7 +25,7 @@ class HybridLocalizer:
 
     def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[QueryPrediction]:
         """Return the prediction of the network for each query; see `Localizer`."""
-        return self.feed_forward.predict(queries)
+        return self.feed_forward.predict(queries, following)
 
     @fixed_sums
     def localize(
