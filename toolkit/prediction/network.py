@@ -186,7 +186,7 @@ class NetworkPredictor:
         batch_size = self._batch_size or (1 if self._device.type == "cpu" else _GROUPS_AT_A_TIME)
         for numbers in alike.values():
             batches = [numbers[start : start + batch_size] for start in range(0, len(numbers), batch_size)]
-            encoded = self._encoded([[placed[number] for number in batch] for batch in batches])
+            encoded = self._encoded([[placed[number] for number in batch] for batch in batches], begun)
             for batch, tokens in zip(batches, encoded, strict=True):
                 self._run(batch, [placed[number] for number in batch], tokens, results)
         return results
