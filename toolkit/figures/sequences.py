@@ -19,17 +19,7 @@ from toolkit.figures.style import GREEN, ORANGE, SKY, VERMILLION, new_figure, pe
 from toolkit.figures.top_view import Ground, Layer, draw_places
 from toolkit.files import pair_name, require_current, require_whole
 from toolkit.geometry import Floats
-from toolkit.results.metrics import (
-    WRONG,
-    Threshold,
-    is_below,
-    is_posed,
-    parse_threshold,
-    pose_errors,
-    recall,
-    threshold_name,
-    unit_of,
-)
+from toolkit.results.metrics import WRONG, Threshold, is_below, is_posed, pose_errors, summary_of, threshold_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -144,16 +134,9 @@ class SequencePair:
             translation = translation / length
             within = is_below(rotation_deg, translation, limits[-1])
             first = within if first is None else first
-            shares = recall(rotation_deg, translation, limits)
-            rows.append({
-                "step": step,
-                "queries": len(keys),
-                **{f"recall@{threshold_name(t, unit)}": share for t, share in zip(limits, shares, strict=True)},
-                "median_rotation_deg": float(np.median(rotation_deg)),
-                "median_translation_m": float(np.median(translation)),
-                "rescued": int((within & ~first).sum()),
-                "broken": int((first & ~within).sum()),
-            })  # fmt: skip
+            counts = {"rescued": int((within & ~first).sum()), "broken": int((first & ~within).sum())}
+            summary = summary_of(rotation_deg, translation, limits, unit)
+            rows.append({"step": step, "queries": len(keys), **summary, **counts})
         return rows
 
 
@@ -238,8 +221,7 @@ def draw_steps(table: pd.DataFrame) -> "Figure":
         for x, mean in enumerate(means):
             plot.text(x, 3, percent(mean / 100), ha="center", fontsize=8)
         plot.set_xticks(range(len(steps)), steps, rotation=45, ha="right")
-        degrees, length = parse_threshold(column)
-        plot.set_title(f"recall @ {degrees:g}°, {length:g} {unit_of(column)}", fontsize=10)
+        plot.set_title(f"recall @ {threshold_text(column)}", fontsize=10)
     plots[0].set_ylabel("queries [%]")
     figure.suptitle("Recall after each step: mean of all pairs (bars), each pair (dots)")
     return figure
