@@ -3,7 +3,7 @@
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -158,6 +158,20 @@ def log_points(stream: "rr.RecordingStream", points: ArrayLike, colors: NDArray[
 
     cloud = rr.Points3D(points, colors=rgb(POINT_COLOR) if colors is None else colors, radii=rr.Radius.ui_points(1.5))
     stream.log("world/points", cloud, static=True)
+
+
+def log_lines(stream: "rr.RecordingStream", path: str, lines: Sequence[Floats], color: str) -> None:
+    """Log lines, (n, 3) each."""
+    import rerun as rr
+
+    stream.log(path, rr.LineStrips3D(lines, colors=rgb(color)), static=True)
+
+
+def hidden_camera() -> "rr.Pinhole":
+    """Return any camera that is too small to see."""
+    import rerun as rr
+
+    return rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=HIDDEN_M)
 
 
 def rgb(color: str) -> list[int]:

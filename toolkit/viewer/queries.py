@@ -4,6 +4,7 @@ import logging
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     import rerun as rr
 
 logger = logging.getLogger(__name__)
-
 
 QUERY = "query"
 """Timeline of the query numbers, which are the rows of the pair's csv."""
@@ -61,7 +61,6 @@ def record_localizations(
         tracks: positions (n, 3) of each piece of the query recordings: `odometry`, rigidly placed in the map, and
             `frames`, as estimated by the sequence stage.
     """
-    import rerun as rr
 
     started = time.perf_counter()
     poses = map_poses[is_posed(map_poses)]
@@ -78,8 +77,7 @@ def record_localizations(
         _log_overview(stream, localizations)
         for kind, color in (("odometry", ORANGE), ("frames", SKY)):
             if tracks and tracks.get(kind):
-                lines = rr.LineStrips3D([track + shift for track in tracks[kind]], colors=viewer.rgb(color))
-                stream.log(f"world/recording/{kind}", lines, static=True)
+                viewer.log_lines(stream, f"world/recording/{kind}", [track + shift for track in tracks[kind]], color)
         writer = _ChosenWriter(stream, localizations, 2 * size)
         for number, chosen in prefetch(writer.read, details):
             writer.write(number, chosen)
@@ -94,19 +92,13 @@ def _layout(name: str, poses: Floats, up: Floats) -> Any:
     import rerun.blueprint as rrb
 
     scene = viewer.scene_view(poses, up, name)
+    cameras = {f"query, camera {k}": f"world/chosen/camera_{k}" for k in range(MAX_CAMERAS)}
+    ranked = {f"reference {rank}": f"world/references/{rank}" for rank in range(1, REFERENCES + 1)}
     # Show marks only in the 2D views: on the image planes of the 3D scene they would hide it.
-    hidden = [f"- /world/chosen/camera_{k}/marks/**" for k in range(MAX_CAMERAS)]
-    hidden += [f"- /world/references/{rank}/marks/**" for rank in range(1, REFERENCES + 1)]
-    scene.contents = ["+ $origin/**", *hidden]
-    query = rrb.Tabs(
-        *[rrb.Spatial2DView(origin=f"world/chosen/camera_{k}", name=f"query, camera {k}") for k in range(MAX_CAMERAS)]
-    )
+    scene.contents = ["+ $origin/**", *(f"- /{path}/marks/**" for path in (cameras | ranked).values())]
+    query = rrb.Tabs(*(rrb.Spatial2DView(origin=path, name=name) for name, path in cameras.items()))
     references = rrb.Grid(
-        *[
-            rrb.Spatial2DView(origin=f"world/references/{rank}", name=f"reference {rank}")
-            for rank in range(1, REFERENCES + 1)
-        ],
-        grid_columns=2,
+        *(rrb.Spatial2DView(origin=path, name=name) for name, path in ranked.items()), grid_columns=2
     )
     about = rrb.Horizontal(
         rrb.TextDocumentView(origin="about", name="about the query"),
@@ -133,7 +125,7 @@ def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
     import rerun as rr
 
     located, has_truth = is_posed(queries.estimated), is_posed(queries.true)
-    colors = error_colors(queries.ranked["translation_error_m"])
+    colors = error_colors(queries.errors["translation_error_m"])
     labels = np.array([f"#{k} {describe(queries, k)}" for k in range(len(queries.names))], object)
 
     def dots(path: str, rows: NDArray[np.bool_], centers: Floats, color: Any, radius: float) -> None:
@@ -172,29 +164,27 @@ class _ChosenWriter:
         """Log a query. Entities that it lacks are cleared, or those of the last query would stay."""
         import rerun as rr
 
-        self._stream.set_time(QUERY, sequence=number)
-        for k in range(MAX_CAMERAS):
-            image = query.cameras[k] if k < len(query.cameras) else None
+        stream, references, center = self._stream, query.captioned_references(), self._queries.estimated[number, :3, 3]
+        stream.set_time(QUERY, sequence=number)
+        for k, image in zip_longest(range(MAX_CAMERAS), query.cameras[:MAX_CAMERAS]):
             self._log_image(f"world/chosen/camera_{k}", image, ESTIMATED, residuals=True)
-        references = query.captioned_references()
-        for rank in range(1, REFERENCES + 1):
-            image, _, agrees = references[rank - 1] if rank <= len(references) else (None, "", True)
+        for rank, reference in zip_longest(range(1, REFERENCES + 1), references):
+            image, _, agrees = reference or (None, "", True)
             self._log_image(f"world/references/{rank}", image, SKY if agrees else ORANGE, residuals=False)
         if query.cameras:
             camera, true = query.cameras[0].camera, query.cameras[0].world_from_cam_true
             has_truth = bool(is_posed(true))
             if has_truth:
-                self._stream.log("world/truth/camera_0", viewer.transform_of(true))
-            shown = (camera.width, camera.height)
-            pinhole = viewer.pinhole_of(camera, shown, self._depth_m if has_truth else viewer.HIDDEN_M, TRUE)
-            self._stream.log("world/truth/camera_0", pinhole)
+                stream.log("world/truth/camera_0", viewer.transform_of(true))
+            depth_m = self._depth_m if has_truth else viewer.HIDDEN_M
+            pinhole = viewer.pinhole_of(camera, (camera.width, camera.height), depth_m, TRUE)
+            stream.log("world/truth/camera_0", pinhole)
         points = np.concatenate([np.zeros((0, 3)), *(image.points[image.inlier] for image in query.cameras)])
         dots = rr.Points3D(points, colors=viewer.rgb(GREEN), radii=rr.Radius.ui_points(3))
-        self._stream.log("world/chosen_points", dots)
-        center = self._queries.estimated[number, :3, 3]
-        lines = [np.stack([center, image.world_from_cam[:3, 3]]) for image in query.references]
-        located = bool(is_posed(self._queries.estimated[number]))
-        self._stream.log("world/lines", rr.LineStrips3D(lines if located else [], colors=viewer.rgb(ORANGE)))
+        stream.log("world/chosen_points", dots)
+        located = bool(np.isfinite(center).all())
+        lines = [np.stack([center, image.world_from_cam[:3, 3]]) for image in query.references if located]
+        stream.log("world/lines", rr.LineStrips3D(lines, colors=viewer.rgb(ORANGE)))
         text = [f"**query {number}: {describe(self._queries, number)}**", ""]
         text += [f"- {image.name}" for image in query.cameras]
         if query.has_matches:
@@ -204,31 +194,27 @@ class _ChosenWriter:
         elif located:
             text += ["", "No matches: the pose comes from the references as a whole.", ""]
         text += [f"{rank}. {image.name}: {caption}" for rank, (image, caption, _) in enumerate(references, start=1)]
-        self._stream.log("about", rr.TextDocument("\n".join(text), media_type="text/markdown"))
+        stream.log("about", rr.TextDocument("\n".join(text), media_type="text/markdown"))
 
     def _log_image(self, path: str, image: ShownImage | None, color: str, residuals: bool) -> None:
         """Log an image (None: a gray one) with its camera, keypoints and, for `residuals`, projected points."""
         import rerun as rr
 
-        stream = self._stream
-        measured, inlier = np.zeros((0, 2)), np.zeros(0, bool)
+        stream, measured, inlier = self._stream, np.zeros((0, 2)), np.zeros(0, bool)
         predicted, lines = np.zeros((0, 2)), np.zeros((0, 2, 2))
         if image is None:
             # Keep the size of the last image: the viewer treats the images of an entity as frames of a video.
             width, height = self._sizes.get(path, (4, 3))
-            blank = np.full((height, width, 3), 60, np.uint8)
-            data, _ = viewer.small_jpeg(blank, max(blank.shape))
-            # Any camera that is too small to see.
-            stream.log(path, rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=viewer.HIDDEN_M))
+            data, _ = viewer.small_jpeg(np.full((height, width, 3), 60, np.uint8), max(width, height))
+            stream.log(path, viewer.hidden_camera())
         else:
-            data, shown = self._jpeg_of(image.path)
-            self._sizes[path] = shown
+            data, self._sizes[path] = self._jpeg_of(image.path)
             located = bool(is_posed(image.world_from_cam))
             if located:
                 stream.log(path, viewer.transform_of(image.world_from_cam))
             depth_m = self._depth_m if located else viewer.HIDDEN_M
-            stream.log(path, viewer.pinhole_of(image.camera, shown, depth_m, color))
-            scale = np.array(shown) / [image.camera.width, image.camera.height]
+            stream.log(path, viewer.pinhole_of(image.camera, self._sizes[path], depth_m, color))
+            scale = np.array(self._sizes[path]) / [image.camera.width, image.camera.height]
             measured, inlier = image.pixels * scale, image.inlier
             if located and residuals and inlier.any():
                 pixels, visible = project(image.points[inlier], image.camera, image.world_from_cam)
@@ -251,7 +237,7 @@ def _jpeg_of(path: Path) -> tuple[bytes, tuple[int, int]]:
 
 def describe(queries: Localizations, k: int) -> str:
     """Return one line of text about a query: name, status, errors, inliers."""
-    row = queries.ranked.iloc[k]
+    row = queries.errors.iloc[k]
     parts = [str(queries.names[k]), str(row["status"])]
     if np.isfinite(row["translation_error_m"]):
         parts.append(f"off by {row['rotation_error_deg']:.2g}°, {row['translation_error_m']:.3g} {queries.unit[0]}")
