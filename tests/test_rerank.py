@@ -18,7 +18,8 @@ from toolkit import rerank
 from toolkit.capture import Capture, Trajectory
 from toolkit.embed import embed_sessions
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError
-from toolkit.evaluate import overlap_in_view, overlap_table
+from toolkit.evaluate import overlap_table
+from toolkit.results.metrics import overlap_in_view
 from toolkit.features import verification
 from toolkit.features.features import KINDS, LocalFeatures
 from toolkit.features.matching import LocalMethod, MutualMatcher
