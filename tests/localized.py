@@ -1,7 +1,7 @@
 """What the localize stage leaves of a pair, written by hand: poses, the table of queries, and correspondences."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +9,29 @@ import pandas as pd
 
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.files import pair_name
-from toolkit.pose.correspondences import MAPS, Correspondences, LocalizedQuery, query_group
+from toolkit.pose.result import Correspondences, QueryResult, Rival, Status
+from toolkit.results.pair import MAPS, PairResults, query_group
 from toolkit.store.hdf5 import write_groups
 
 
-def write_queries(path: Path, queries: Mapping[tuple[int, str], LocalizedQuery], maps: Sequence[str] = ()) -> None:
+def stored(
+    images: Sequence[str] = (),
+    references: Sequence[str] = (),
+    rejected: Sequence[str] = (),
+    correspondences: Correspondences | None = None,
+    rivals: Sequence[Rival] = (),
+) -> QueryResult:
+    """Return what the file of correspondences holds of a query."""
+    names = {"images": tuple(images), "references": tuple(references), "rejected": tuple(rejected)}
+    return QueryResult(Status.OK, correspondences=correspondences or Correspondences(), rivals=tuple(rivals), **names)
+
+
+def read_queries(path: Path) -> Callable[[int, str], QueryResult]:
+    """Return a function that reads what the file of correspondences holds of a query, by timestamp and device id."""
+    return PairResults(path, pd.DataFrame()).stored
+
+
+def write_queries(path: Path, queries: Mapping[tuple[int, str], QueryResult], maps: Sequence[str] = ()) -> None:
     """Write the correspondences of a pair."""
     groups = ((query_group(*key), query.arrays()) for key, query in queries.items())
     write_groups(path, groups, {MAPS: json.dumps(list(maps))})
@@ -30,7 +48,7 @@ def write_pair(
     folder: Path,
     map_device: str,
     query_device: str,
-    queries: Sequence[LocalizedQuery],
+    queries: Sequence[QueryResult],
     maps: Sequence[str] = (),
     **columns: Sequence[object],
 ) -> Path:

@@ -12,7 +12,8 @@ from toolkit.capture import Session
 from toolkit.features.features import LocalFeatures
 from toolkit.features.stores import FeatureStore
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.base import NetworkMatches, PoseEstimate, Query, References, View
+from toolkit.pose.base import NetworkMatches, Query, References, View
+from toolkit.pose.result import QueryResult
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -52,18 +53,23 @@ def ask(
     references: Sequence[Sequence[int]],
     network_matches: Sequence[list[NetworkMatches | None]] = (),
     **more: Any,
-) -> PoseEstimate:
+) -> QueryResult:
     """Localize a query, see `query_of`, with the map images of the given indices as references of each image.
 
     Args:
         more: what else the localizer's `localize` takes by name: `prediction`, `priors`.
     """
     query = query_of(cameras, rig_from_cams, features, network_matches=network_matches)
-    estimate: PoseEstimate = localizer.localize(query, [References.of(images) for images in references], **more)
+    estimate: QueryResult = localizer.localize(query, [References.of(images) for images in references], **more)
     return estimate
 
 
-def rests_on(estimate: PoseEstimate) -> tuple[Ints, Floats, Ints]:
+def indices_of(names: Sequence[str]) -> list[int]:
+    """Return the numbers of images named by them, such as 3 of `ios_map/raw_data/3.jpg`."""
+    return [int(name.rpartition("/")[2].removesuffix(".jpg")) for name in names]
+
+
+def rests_on(estimate: QueryResult) -> tuple[Ints, Floats, Ints]:
     """Return query image (K,), pixels (K, 2) and map point (K,) of the guided matches that the pose agrees with."""
     matches = estimate.correspondences
     kept = matches.inlier & np.char.endswith(matches.found_by, "/guided")

@@ -42,19 +42,19 @@ from toolkit.files import SceneFiles, image_name, map_record_path, read_map_reco
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
 from toolkit.manifest import EmbedSettings, LocalizeSettings
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.base import PoseEstimate, Prior, Query, RoughPose, View
-from toolkit.pose.correspondences import LocalizedQueries
-from toolkit.pose.escalation import EscalatingLocalizer
+from toolkit.pose.base import Localizer, Prior, Query, QueryMatches, RoughPose, View
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer
+from toolkit.pose.result import QueryResult, Status
 from toolkit.prediction import registry as predictors
 from toolkit.prediction.interface import Prediction
 from toolkit.prediction.simulated import SimulatedPredictor
 from toolkit.rerank import rerank_pairs
+from toolkit.results.pair import PairResults
 from toolkit.retrieve import load_embeddings, retrieve_pairs
-from toolkit.scene import create_localizer
 from toolkit.scene import map as maps
-from toolkit.scene.locate import pixels_from
+from toolkit.scene import search
+from toolkit.scene.query import pixels_from
 from toolkit.sequence import sequence_pairs
 
 LIST = "keyframes_original"
@@ -252,10 +252,8 @@ def test_wrong_questions_are_refused(
 
 
 def test_a_pose_without_covariance_leaves_the_others_theirs(tmp_path: Path) -> None:
-    rows = [
-        {"timestamp": time, "device_id": "a", "qt": [1.0, 0, 0, 0, 0, 0, 0], "covariance": covariance}
-        for time, covariance in ((1, np.eye(6).ravel().tolist()), (2, None))
-    ]
+    covariances = np.eye(6), np.full((6, 6), np.nan)
+    rows = [({"timestamp": time, "device_id": "a"}, np.eye(4), covariances[time]) for time in (0, 1)]
     pair = SimpleNamespace(file=lambda suffix: tmp_path / f"pair.{suffix}")
     localize._write_poses(pair, rows, LocalizeSettings())  # type: ignore[arg-type]
     np.testing.assert_array_equal(Trajectory.read(pair.file("txt")).covariances, [np.eye(6), np.full((6, 6), np.nan)])
@@ -333,10 +331,8 @@ def test_a_keyframe_that_is_listed_twice_is_one_query(capture: Path, run: SceneF
     path = capture / "sessions" / "ios_query" / "proc" / f"{LIST}.txt"
     path.write_text(path.read_text() + path.read_text().splitlines()[-1] + "\n5, a/b\n5, a-b\n")
     table = run_stage(capture, run, query_device="ios")
-    rows = rows_of(run, "ios")
     assert table[["queries", "failed"]].to_numpy().tolist() == [[5, 2]]
-    localized = LocalizedQueries(run.poses_txt("ios", "ios").with_suffix(".h5"))
-    assert set(localized) == set(zip(rows["timestamp"], rows["device_id"], strict=True))
+    assert [bool(result.images) for result in PairResults.open(run.poses_txt("ios", "ios"))] == [True] * 3 + [False] * 2
 
 
 def test_an_image_that_was_not_retrieved_for_is_a_row(small_capture: Path, run: SceneFiles) -> None:
@@ -372,8 +368,7 @@ def test_a_fault_of_the_toolkit_is_tried_again_by_the_next_run(
     assert len(calls) == 1, "of that query alone"
     assert not table["skipped"].item()
     assert run.poses_txt("ios", "ios").read_bytes() == finished[0].poses_txt("ios", "ios").read_bytes()
-    localized = LocalizedQueries(run.poses_txt("ios", "ios").with_suffix(".h5"))
-    assert all(query.correspondences.inlier.any() for query in localized.values())
+    assert all(query.correspondences.inlier.any() for query in PairResults.open(run.poses_txt("ios", "ios")))
     assert run_stage(small_capture, run, query_device="ios")["skipped"].item()
 
 
@@ -413,18 +408,23 @@ def test_what_is_a_property_of_a_query_is_its_result(
 # -------------------------------------------------------------------------------------- reuse, resume, order
 
 
+def described(vectors: Sequence[np.ndarray]) -> Query:
+    """Return a query that has global descriptors (C, D), by embedder, and nothing else."""
+    return Query([], np.tile(np.eye(4), (len(vectors[0]), 1, 1)), descriptors=vectors)
+
+
 def spy(monkeypatch: pytest.MonkeyPatch, fail_at: int | None = None, error: BaseException | None = None) -> list[int]:
     """Count the queries that are localized from now on; fail at one of them."""
     calls: list[int] = []
-    work: Callable[..., PoseEstimate] = PnpLocalizer.localize
+    work: Callable[..., QueryResult] = PnpLocalizer.solve
 
-    def counted(self: PnpLocalizer, *args: object, **named: object) -> PoseEstimate:
+    def counted(self: PnpLocalizer, *args: object, **named: object) -> QueryResult:
         calls.append(len(calls))
         if error is not None and calls[-1] == fail_at:
             raise error
         return work(self, *args, **named)
 
-    monkeypatch.setattr(PnpLocalizer, "localize", counted)
+    monkeypatch.setattr(PnpLocalizer, "solve", counted)
     return calls
 
 
@@ -499,19 +499,16 @@ def test_a_first_answer_that_is_not_bettered_stays(
     small_capture: Path, run: SceneFiles, finished: tuple[SceneFiles, pd.DataFrame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     add_other_kind(monkeypatch)
-    failed = PoseEstimate("failed: no consistent pose")
-    monkeypatch.setattr(maps.OnDemandLocalizer, "localize", lambda *_: failed)
+    failed = QueryResult.failed("no consistent pose")
+    monkeypatch.setattr(maps.OnDemandLocalizer, "solve", lambda *_: failed)
     run_stage(small_capture, run, query_device="ios", **ESCALATES)
     assert run.poses_txt("ios", "ios").read_bytes() == finished[0].poses_txt("ios", "ios").read_bytes()
     table = rows_of(run, "ios")
     assert (table["status"] == "low_confidence").all()
     assert (table["method"] == "pnp").all()
     assert (table["first_status"] == "low_confidence").all()
-    kept, before = (
-        LocalizedQueries(files.poses_dir / f"{files.poses_txt('ios', 'ios').stem}.h5") for files in (run, finished[0])
-    )
-    for timestamp, device in zip(table["timestamp"], table["device_id"], strict=True):
-        a, b = (queries[timestamp, device].correspondences for queries in (kept, before))
+    for both in zip(*(PairResults.open(files.poses_txt("ios", "ios")) for files in (run, finished[0])), strict=True):
+        a, b = (result.correspondences for result in both)
         np.testing.assert_array_equal(a.pixels, b.pixels)
         np.testing.assert_array_equal(a.inlier, b.inlier)
 
@@ -576,7 +573,7 @@ def test_a_run_killed_at_its_end_leaves_no_files_of_two_runs(small_capture: Path
     assert not run.poses_txt("ios", "ios").exists()
     run_stage(small_capture, run, query_device="ios")
     assert run.poses_txt("ios", "ios").read_bytes() == before
-    assert all(query.correspondences.inlier.any() for query in LocalizedQueries(path).values())
+    assert all(query.correspondences.inlier.any() for query in PairResults.open(path))
 
 
 @pytest.mark.slow
@@ -722,7 +719,7 @@ def camera_of(params: list[float], width: int = 10) -> pycolmap.Camera:
         ({"image": None}, "None"),
         ({"image": b"bytes"}, "bytes"),
         ({"image": [[1, 2], [3]]}, "list"),
-        ({"image": ["1.jpg", "2.jpg"]}, "2 pictures, 1 cameras"),
+        ({"image": ["1.jpg", "2.jpg"]}, "2 images, 1 cameras"),
         ({"camera": "PINHOLE, 10, 20, 10, 10, 5, 10"}, "camera: found 'PINHOLE.*parse_camera"),
         ({"camera": None}, "camera: found None"),
         ({"camera": camera_of([10, 10, 5])}, "camera: found 3 parameters"),
@@ -730,15 +727,15 @@ def camera_of(params: list[float], width: int = 10) -> pycolmap.Camera:
         ({"camera": camera_of([np.nan, 10, 5, 10])}, "camera: .*finite"),
         ({"camera": camera_of([10, 10, 5, 10], width=11)}, "10 x 20 pixels, its camera 11 x 20"),
         ({"rig_from_cams": np.eye(3)}, r"rig_from_cams: found \(3, 3\)"),
-        ({"image": [], "camera": []}, "0 pictures"),
-        ({"image": "12345.jpg", "camera": []}, "1 pictures, 0 cameras"),
+        ({"image": [], "camera": []}, "0 images"),
+        ({"image": "12345.jpg", "camera": []}, "1 images, 0 cameras"),
         ({"turns": [1, 2]}, "2 turns"),
         ({"turns": 1}, "turns: found 1, expected whole numbers"),
         ({"turns": ["a"]}, r"turns: found \['a'\], expected whole numbers"),
         ({"rig_from_cams": "x"}, r"rig_from_cams: found 'x', expected \(C, 4, 4\) numbers"),
-        ({"rig_from_cams": np.diag([1.0, 1, -1, 1])}, "rig_from_cams: found no pose for picture 1: .* nor mirrors"),
-        ({"rig_from_cams": np.diag([2.0, 2, 2, 1])}, "rig_from_cams: found no pose for picture 1: .* neither scales"),
-        ({"rig_from_cams": np.ones((1, 4, 4))}, "rig_from_cams: found no pose for picture 1"),
+        ({"rig_from_cams": np.diag([1.0, 1, -1, 1])}, "rig_from_cams: found no pose for image 1: .* nor mirrors"),
+        ({"rig_from_cams": np.diag([2.0, 2, 2, 1])}, "rig_from_cams: found no pose for image 1: .* neither scales"),
+        ({"rig_from_cams": np.ones((1, 4, 4))}, "rig_from_cams: found no pose for image 1"),
     ],
 )
 def test_what_is_no_picture_is_refused(opened: Map, changed: dict, message: str) -> None:
@@ -781,12 +778,13 @@ def test_a_picture_is_turned_for_what_the_run_turned_images_for(
     files = finished[0]
     place = Map.open(files.run, files.scene, "ios")
     place.settings = LocalizeSettings.of({"method": "feed_forward"})
-    place.embed_settings = EmbedSettings.of({"upright": upright})  # type: ignore[misc]
-    learned = Learned(np.ones(place._descriptors[0].shape[1], np.float32))
-    place.embedders = [learned]  # type: ignore[misc]
+    place.search.embed_settings = EmbedSettings.of({"upright": upright})  # type: ignore[misc]
+    learned = Learned(np.ones(place.search._descriptors[0].shape[1], np.float32))
+    place.search.embedders = [learned]  # type: ignore[misc]
     asked: list[Query] = []
-    answer = SimpleNamespace(localize=lambda query, _: asked.append(query), image_names=[])
-    place.localizer = answer  # type: ignore[misc, assignment]
+    localizer = AsManyAsFeatures(place.mapped)
+    localizer.solve = lambda matches, *_: asked.append(matches.query) or QueryResult(Status.OK)  # type: ignore
+    vars(place)["localizer"] = localizer
     camera = pycolmap.Camera(model="PINHOLE", width=10, height=20, params=[10, 10, 5, 10])
     localize_image(place, np.zeros((20, 10), np.uint8), camera, turns=[1])
     assert learned.seen == [(10, 20, 3) if upright is None else (20, 10, 3)]
@@ -797,7 +795,7 @@ def test_a_picture_of_nothing_has_no_pose(small_capture: Path, opened: Map) -> N
     session = Capture.open(small_capture)["ios_query"]
     camera = session.camera(session.images["sensor_id"].iloc[0])
     answer = localize_image(opened, np.zeros((camera.height, camera.width), np.uint8), camera)
-    assert answer.status == "failed: too few matches"
+    assert answer.status_text == "failed: too few matches"
     assert answer.world_from_rig is None
 
 
@@ -823,7 +821,7 @@ def test_a_run_whose_capture_has_moved_opens_after_the_next_run(
     assert place.session.path == moved / "sessions" / "ios_map"
     assert place.settings.compute_device == "cpu", "as the last run had it"
     path = run.poses_txt("ios", "ios").with_suffix(".h5")
-    assert all(query.correspondences.inlier.any() for query in LocalizedQueries(path).values())
+    assert all(query.correspondences.inlier.any() for query in PairResults.open(path))
     stamp = path.stat().st_mtime_ns
     run_stage(moved, run, query_device="ios", compute_device="cpu")
     assert path.stat().st_mtime_ns == stamp
@@ -846,8 +844,8 @@ def test_a_run_with_a_torn_file_of_correspondences_says_so(
 def test_a_map_without_points_is_refused(small_capture: Path, run: SceneFiles) -> None:
     run_stage(small_capture, run, query_device="ios", method="nearest")
     place = Map.open(run.run, run.scene, "ios")
-    with pytest.raises(ArtifactError, match=r"'nearest'.*'pnp'"):
-        create_localizer(LocalizeSettings(), place)
+    with pytest.raises(ArtifactError, match=r"has no points.*'pnp'"):
+        _ = place.changed({"method": "pnp"}).localizer
 
 
 def test_a_localizer_of_another_method_sees_images_upright_as_its_settings_say(
@@ -856,7 +854,7 @@ def test_a_localizer_of_another_method_sees_images_upright_as_its_settings_say(
     directions: list[object] = []
     monkeypatch.setattr(maps, "upright_turns", lambda _, direction: directions.append(direction))
     settings = {"method": "feed_forward", "predictor": {"name": "simulated"}, "world_up": [0, 0, 1]}
-    create_localizer(LocalizeSettings.of(opened.settings, settings), opened)
+    _ = replace(opened, settings=LocalizeSettings.of(opened.settings, settings)).localizer
     assert directions == [[0, 0, 1]]
 
 
@@ -949,43 +947,34 @@ def test_a_learned_embedder_is_given_colors(small_capture: Path, finished: tuple
     place = Map.open(files.run, files.scene, "ios")
     expected = localize_image(place, path, camera)
     store = extract_session(session, files.features)
-    learned = Learned(place.embedders[0].embed([store[session.image_name(0)]])[0])
-    place.embedders = [learned]  # type: ignore[misc]
+    learned = Learned(place.search.embedders[0].embed([store[session.image_name(0)]])[0])
+    place.search.embedders = [learned]  # type: ignore[misc]
     np.testing.assert_array_equal(localize_image(place, path, camera).world_from_rig, expected.world_from_rig)
     assert learned.seen == [(camera.height, camera.width, 3)]
     learned.least_side = camera.height // 4
     np.testing.assert_array_equal(localize_image(place, path, camera).world_from_rig, expected.world_from_rig)
     assert learned.seen[1] == (camera.height // 4, camera.width // 4, 3), "as the stage decodes it"
-    place.embedders = [Learned(np.zeros(7, np.float32))]  # type: ignore[misc]
+    place.search.embedders = [Learned(np.zeros(7, np.float32))]  # type: ignore[misc]
     with pytest.raises(ArtifactError, match="expected 7 of learned"):
         localize_image(place, path, camera)
 
 
-class AsManyAsFeatures:
+class AsManyAsFeatures(Localizer):
     """A localizer of somebody's own, which counts the features that it is given."""
 
-    batch_size = 1
+    def __init__(self, mapped: Sequence[MappedFeatures], *_: object) -> None:
+        self.image_names = mapped[0].map.image_names
 
-    def __init__(self, image_names: list[str]) -> None:
-        self.image_names = image_names
-
-    def predict(self, queries: Sequence[object], following: Sequence[object] = ()) -> list[None]:
-        return [None] * len(queries)
-
-    def localize(self, query: Query, _: object, prediction: None = None) -> PoseEstimate:
-        return PoseEstimate("failed: counts only", num_matches=len(query.features[0][0]))
+    def solve(self, matches: QueryMatches, prediction: None = None, priors: Sequence[Prior] = ()) -> QueryResult:
+        return QueryResult.failed("counts only", num_matches=len(matches.query.features[0][0]))
 
 
 def test_a_method_of_ones_own_is_given_features_as_in_a_run(
     small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (maps, localize):
-        monkeypatch.setattr(
-            module, "create_localizer", lambda _, place, *__: AsManyAsFeatures(place.mapped[0].map.image_names)
-        )
+    monkeypatch.setattr(maps, "PnpLocalizer", AsManyAsFeatures)
     run_stage(small_capture, run, query_device="ios")
     place = Map.open(run.run, run.scene, "ios")
-    monkeypatch.setattr(place, "settings", place.settings.model_copy(update={"method": "counts"}))
     session = Capture.open(small_capture)["ios_query"]
     row = int(session.rows_of_keyframes(session.keyframes(LIST))[0][0])
     camera = session.camera(session.images["sensor_id"].iloc[row])
@@ -1050,7 +1039,7 @@ def test_pictures_and_inspections_get_the_pose_of_the_run_byte_for_byte(
     keyframes = session.keyframes(LIST)
     quarter_turns = place.turns.of(session) if place.turns else np.zeros(len(session.images), int)
     lines = run.poses_txt("ios", device).read_text().splitlines()[1:]
-    localized = LocalizedQueries(run.poses_dir / f"{run.poses_txt('ios', device).stem}.h5")
+    localized = PairResults.open(run.poses_txt("ios", device))
     queries = zip(lines, session.rows_of_keyframes(keyframes), keyframes.itertuples(index=False), strict=True)
     for number, (line, rows, key) in enumerate(queries):
         paths = [session.image_path(int(row)) for row in rows]
@@ -1065,9 +1054,9 @@ def test_pictures_and_inspections_get_the_pose_of_the_run_byte_for_byte(
         assert text in line, f"{key.timestamp}"
         if number < 2:
             again = pair.look(number).again().after
-            np.testing.assert_array_equal(again.pose, estimate.world_from_rig)
-            assert (again.status, again.numbers["num_inliers"]) == (estimate.status, estimate.num_inliers)
-        before = localized[key.timestamp, key.device_id].correspondences
+            np.testing.assert_array_equal(again.result.world_from_rig, estimate.world_from_rig)
+            assert (again.result.status, again.numbers["num_inliers"]) == (estimate.status, estimate.num_inliers)
+        before = localized[number].correspondences
         np.testing.assert_array_equal(before.point_index, estimate.correspondences.point_index)
         np.testing.assert_array_equal(before.inlier, estimate.correspondences.inlier)
 
@@ -1080,7 +1069,7 @@ def test_the_unit_that_an_import_noted_is_that_of_every_door(capture: Path, run:
     by_hand = run.poses_txt("ios", "ios").read_bytes()
     assert read_map_record(map_record_path(run.poses_dir, run.scene, "ios"))["unit"] is None
     assert Map.open(run.run, run.scene, "ios").settings.unit is None
-    assert InspectedPair("ios", "ios", run.poses_dir).localized.unit[0] != "m"
+    assert InspectedPair("ios", "ios", run.poses_dir).localized.results.unit[0] != "m"
     assert not [name for name in pd.read_csv(run.poses_csv("ios", "ios")) if name.endswith("_m")], "no meters"
     folders = run.poses_dir, run.retrieval_dir, run.evaluation
     evaluate_scene(capture / "sessions", *folders, map_device="ios", query_device="ios", queries=LIST)
@@ -1089,7 +1078,7 @@ def test_the_unit_that_an_import_noted_is_that_of_every_door(capture: Path, run:
     errors = pd.read_csv(run.evaluation / "errors.csv")
     assert {"translation_error_L", "position_std_L"} <= {*errors}
     table = pd.read_csv(run.poses_csv("ios", "ios"))
-    length = InspectedPair("ios", "ios", run.poses_dir).localized.unit[1]
+    length = InspectedPair("ios", "ios", run.poses_dir).localized.results.unit[1]
     np.testing.assert_allclose(errors["position_std_L"] * length, table["position_std"])
     assert set(table["unit"]) == {"unknown"}
     table = run_stage(capture, run, query_device="ios", unit=None)  # as a run of the manifest of `new`
@@ -1126,7 +1115,7 @@ def test_a_picture_has_the_references_of_a_run_with_an_index(small_capture: Path
     of_run.write_text(json.dumps(json.loads(of_run.read_text()) | {"faiss_gpu": True}))  # where the run was
     place = Map.open(run.run, run.scene, "ios")
     vectors, table = load_embeddings(run.embeddings / "ios_query")
-    found = dict(zip(table["abs_path"], place.retrieve([vectors]), strict=True))
+    found = dict(zip(table["abs_path"], place.retrieve(described([vectors])), strict=True))
     names = place.localizer.image_names
     rows = read_references(run.retrieval("ios", "ios"))
     assert len(rows) >= 3
@@ -1152,7 +1141,7 @@ def test_a_picture_has_the_references_of_a_run_with_several_descriptors(
     session = Capture.open(small_capture)["ios_query"]
     folders = (run.embeddings / name / "ios_query" for name in ("thumbnail", "vlad"))
     stored, tables = zip(*map(load_embeddings, folders), strict=True)
-    as_run = place.embed_settings
+    as_run = place.search.embed_settings
     answers, localize = [], place.localizer.localize
     place.localizer = SimpleNamespace(  # type: ignore[misc, assignment]
         localize=lambda query, references: answers.append(references) or localize(query, references),
@@ -1165,7 +1154,7 @@ def test_a_picture_has_the_references_of_a_run_with_several_descriptors(
         strict=False,
     ):
         camera = session.camera(session.images["sensor_id"].iloc[of_query[0]])
-        place.embed_settings = as_run  # type: ignore[misc]
+        place.search.embed_settings = as_run  # type: ignore[misc]
         pose = localize_image(place, session.image_path(int(of_query[0])), camera).world_from_rig
         assert ", ".join(repr(float(number)) for number in geometry.qt_from_pose(pose)) in line
         expected = rows[session.image_name(int(of_query[0]))]
@@ -1175,8 +1164,8 @@ def test_a_picture_has_the_references_of_a_run_with_several_descriptors(
         np.testing.assert_allclose(answers[-1][0].scores, stated, atol=1e-6)  # a batch of another size
         row = tables[0]["abs_path"].map(image_name).tolist().index(session.image_name(int(of_query[0])))
         # Stored vectors are normalized already, and normalizing once more can change their last bit.
-        place.embed_settings = as_run.model_copy(update={"normalize": False})  # type: ignore[misc]
-        (again,) = place.retrieve([vectors[row : row + 1] for vectors in stored])
+        place.search.embed_settings = as_run.model_copy(update={"normalize": False})  # type: ignore[misc]
+        (again,) = place.retrieve(described([vectors[row : row + 1] for vectors in stored]))
         np.testing.assert_array_equal(again.scores, stated)
 
 
@@ -1308,9 +1297,10 @@ def test_no_pose_is_ok_in_a_map_that_contradicts_its_images(
     assert "OpenGL" in said["text"]
     assert said["text"] in caplog.text
     place = Map.open(run.run, run.scene, "ios")
-    right = PoseEstimate("ok", world_from_rig=np.eye(4))
-    assert place.judged(right).status.startswith("low_confidence: ")
-    assert "OpenGL" in place.judged(right).reason
+    right = QueryResult(Status.OK, world_from_rig=np.eye(4))
+    judged = place.finished(Query([], np.eye(4)[None]), right)
+    assert (judged.status, judged.reason[:9]) == (Status.LOW_CONFIDENCE, "the poses")
+    assert "OpenGL" in judged.remark
     session = Capture.open(capture)["ios_query"]
     picture = localize_image(place, session.image_path(0), session.camera(session.images["sensor_id"].iloc[0]))
     assert picture.status != "ok"
@@ -1382,7 +1372,7 @@ def test_a_picture_is_localized_near_a_rough_pose(
     mapped = place.session.world_from_cam(np.array(rows))
     vectors, _ = load_embeddings(files.embeddings / "ios_map")
     for about in mapped:  # whatever the picture looks like
-        (references,) = place.retrieve([vectors[:1]], near=[RoughPose(about, 1.0, 0.05)])
+        (references,) = place.retrieve(described([vectors[:1]]), near=RoughPose(about, 1.0, 0.05))
         angles = np.degrees(np.arccos(np.clip(mapped[:, :3, 2] @ about[:3, 2], -1, 1)))
         assert sorted(references.images) == np.flatnonzero(angles < 63.0).tolist()
     away = geometry.make_pose(found[:3, :3], [1e6, 0.0, 0.0])
@@ -1396,9 +1386,8 @@ def test_further_features_know_the_images_of_every_kind(opened: Map) -> None:
     rest: dict[str, Any] = {name: getattr(none, name)[1:] for name in ("image_names", "cameras", "world_from_cams")}
     further: Any = SimpleNamespace(name="aliked")
     place = replace(opened, mapped=[MappedFeatures(replace(none, **rest), {}), all_], escalation=[further])
-    localizer = create_localizer(opened.settings, place)
-    assert isinstance(localizer, EscalatingLocalizer)
-    assert localizer.second.image_names == localizer.first.image_names == [*rest["image_names"], first]
+    assert place.fallback is not None
+    assert place.fallback.image_names == place.localizer.image_names == [*rest["image_names"], first]
 
 
 @pytest.mark.parametrize(("length", "radius_deg"), [(1.0, 1.0), (0.1, 3.8183), (0.01, 6.0)])
@@ -1409,8 +1398,9 @@ def test_a_rough_pose_is_as_rough_as_the_map_is_small(
     mapped = opened.mapped[0]
     place = replace(opened, mapped=[MappedFeatures(replace(mapped.map, length=length), mapped.features)])
     priors: list[Prior] = []
-    answer = SimpleNamespace(localize=lambda *asked: priors.extend(asked[3]) or PoseEstimate("ok"), image_names=[])
-    place.localizer = answer  # type: ignore[misc, assignment]
+    localizer = AsManyAsFeatures(place.mapped)
+    localizer.solve = lambda *asked: priors.extend(asked[2]) or QueryResult(Status.OK)  # type: ignore[method-assign]
+    vars(place)["localizer"] = localizer
     camera = pycolmap.Camera(model="PINHOLE", width=10, height=20, params=[10, 10, 5, 10])
     localize_image(place, np.zeros((20, 10), np.uint8), camera, near=RoughPose(np.eye(4), 0.0, 0.01))
     assert [prior.radius_deg for prior in priors] == [pytest.approx(radius_deg, abs=1e-4)]
@@ -1474,11 +1464,12 @@ def test_threads_that_localize_again_have_nothing_to_load(
     opened: list[Map] = []
     open_map = Map.open
     monkeypatch.setattr(Map, "open", lambda *run: opened.append(open_map(*run)) or opened[-1])
-    loaders = "create_localizer", "create_embedder", "open_descriptors", "load_index", "upright_turns"
+    loaders = {maps: ["PnpLocalizer", "upright_turns"], search: ["create_embedder", "open_descriptors", "load_index"]}
 
-    def in_threads(localize: Callable[[int], PoseEstimate], numbers: range, _: int) -> list[PoseEstimate]:
-        for name in loaders:
-            monkeypatch.setattr(maps, name, Mock(side_effect=AssertionError(name)))
+    def in_threads(localize: Callable[[int], QueryResult], numbers: range, _: int) -> list[QueryResult]:
+        for module, names in loaders.items():
+            for name in names:
+                monkeypatch.setattr(module, name, Mock(side_effect=AssertionError(name)))
         assert all("_method" in vars(kind) for kind in opened[0].escalation)
         return [localize(number) for number in numbers]
 
@@ -1496,21 +1487,23 @@ def test_a_query_is_localized_again_as_upright_as_the_networks_of_the_run_saw_it
     files, session = finished[0], Capture.open(small_capture)["hl_query"]
     place = replace(Map.open(files.run, files.scene, "ios"), escalation=[])
     if network == "embedder":
-        place.embedders = [Learned(np.zeros(1, np.float32))]  # type: ignore[misc]
+        vars(place.search)["embedders"] = [Learned(np.zeros(1, np.float32))]
     if network == "reranker":
         place.reranked = True
-        place._verification = LocalMethod("superpoint", Mock(), Mock()), Mock()  # type: ignore[misc]
+        vars(place.search)["_verification"] = LocalMethod("superpoint", Mock(), Mock()), Mock()
     monkeypatch.setattr(Map, "open", lambda *_: place)
     shown: list[Any] = []
     monkeypatch.setattr(
-        sequence, "localize_image", lambda *query: shown.append(query[4]) or PoseEstimate("failed: only shown")
+        Map,
+        "locate",
+        lambda _, query, near: shown.append([view.turns for view in query.views]) or QueryResult.failed("only shown"),
     )
     keys = session.keyframes(LIST)
     sequence._Relocalizer(files.poses_dir, files.scene, "ios", session)(keys, [(0, RoughPose(np.eye(4), 1.0, 0.1))])
     [rows, *_] = session.rows_of_keyframes(keys)
     turned = [3 if sensor.endswith("/hetrf") else 0 for sensor in session.images["sensor_id"].iloc[rows]]
     assert any(turned)
-    assert shown == [None if network == "none" else turned]
+    assert shown == [[0] * len(turned) if network == "none" else turned]
 
 
 def test_poses_of_no_run_cannot_be_localized_again(

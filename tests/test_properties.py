@@ -26,6 +26,7 @@ from hypothesis.extra import numpy as arrays
 
 from tests.conftest import REPOSITORY
 from tests.fuzz.targets import ODD, SESSION_FILES, use_session
+from tests.localized import read_queries, stored
 from toolkit import geometry
 from toolkit.alignment.similarity import Sim3, align_to_map
 from toolkit.capture import Session, Trajectory, camera_text, parse_camera, read_depth, write_depth, write_session
@@ -36,7 +37,8 @@ from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitEr
 from toolkit.exchange.submission import Submission
 from toolkit.files import read_references
 from toolkit.manifest import STAGES, Manifest, load_manifest
-from toolkit.pose.correspondences import Correspondences, LocalizedQueries, LocalizedQuery, query_group
+from toolkit.pose.result import Correspondences
+from toolkit.results.pair import query_group
 from toolkit.store.hdf5 import write_groups
 from toolkit.store.items import Items
 
@@ -325,7 +327,7 @@ def test_correspondences_come_back(data: st.DataObject, keys: list[tuple[int, st
     for key in keys:
         count, views = data.draw(st.integers(0, 3)), data.draw(st.integers(0, 3))
         names = st.lists(ids, max_size=2)
-        queries[key] = LocalizedQuery(
+        queries[key] = stored(
             data.draw(names), data.draw(names), data.draw(names),
             Correspondences(
                 np.arange(count), np.full((count, 2), 1.5), np.full((count, 3), 1 / 3), np.arange(count) - 1,
@@ -338,14 +340,12 @@ def test_correspondences_come_back(data: st.DataObject, keys: list[tuple[int, st
         for key in keys:
             items.add(query_group(*key), "", queries[key].arrays())
     write_groups(tmp_path / "pair.h5", items.items(), {})
-    stored = LocalizedQueries(tmp_path / "pair.h5")
-    assert {*stored} == {*queries}
+    read = read_queries(tmp_path / "pair.h5")
     for key, query in queries.items():
-        back = stored[key]
+        back = read(*key)
         assert (back.images, back.references, back.rejected) == (query.images, query.references, query.rejected)
         for name, array in vars(query.correspondences).items():
             np.testing.assert_array_equal(getattr(back.correspondences, name), array)
-    stored.close()
 
 
 # Manifests

@@ -19,7 +19,7 @@ from toolkit.embed import embed_sessions
 from toolkit.errors import ManifestError
 from toolkit.files import SceneFiles, map_record_path, pair_name
 from toolkit.localize import localize_pairs
-from toolkit.pose.base import PoseEstimate
+from toolkit.pose.result import QueryResult
 from toolkit.retrieve import retrieve_pairs
 from toolkit.sequence import COLUMNS, sequence_pairs
 from toolkit.sequences.pose_graph import FAR
@@ -141,18 +141,19 @@ def test_a_query_that_met_a_bug_is_localized_again_by_the_next_run(
     truth = Session(place / "sessions/ios_query").ground_truth
     assert truth is not None
     localized(tmp_path, place, truth, np.arange(0, len(truth), 2), "low_confidence")
-    monkeypatch.setattr(sequence._Relocalizer, "_map", SimpleNamespace(load=Mock(), turns=None))
+    of_run = SimpleNamespace(load=Mock(), query_of_session=Mock(), locate=Mock())
+    monkeypatch.setattr(sequence._Relocalizer, "_map", of_run)
 
     def skipped(**answer: object) -> bool:
-        monkeypatch.setattr(sequence, "localize_image", Mock(**answer))
+        of_run.locate = Mock(**answer)
         table = sequence_pairs(place / "sessions", tmp_path / "poses", map_device="ios", query_device="ios")
         assert table["again"].item() == len(range(0, len(truth), 2))
         return bool(table["skipped"].item())
 
     assert not skipped(side_effect=RuntimeError("a bug"))
-    of_network = PoseEstimate("failed: too few matches", reason="internal: ValueError: a bug")
+    of_network = QueryResult.failed("too few matches", remark="internal: ValueError: a bug")
     assert not skipped(return_value=of_network)
-    assert not skipped(return_value=PoseEstimate("failed: too few matches"))
+    assert not skipped(return_value=QueryResult.failed("too few matches"))
     assert skipped()
 
 

@@ -6,12 +6,12 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.localized import instants, some_correspondences, write_pair
+from tests.localized import instants, some_correspondences, stored, write_pair
 from toolkit import visualize
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, CaptureError
 from toolkit.figures.style import new_figure
-from toolkit.pose.correspondences import LocalizedQuery, query_group
+from toolkit.results.pair import query_group
 from toolkit.visualize import sample_pictures, visualize_scene
 
 QUICK = {"session_recordings": False, "matched_queries": 2}
@@ -44,7 +44,7 @@ def queries_of(capture, device, count):
     session, image = capture[f"{device}_query"], capture["ios_map"].image_name(0)
     rows = session.rows_of_keyframes(instants(session)[:count])
     found = [some_correspondences([0] * (k + 2), [True] * (k + 1) + [False], references=1) for k in range(count)]
-    return [LocalizedQuery([session.image_name(rows[k][0])], [image], [], found[k]) for k in range(count)]
+    return [stored([session.image_name(rows[k][0])], [image], [], found[k]) for k in range(count)]
 
 
 def test_the_worst_come_first_by_error_and_pictures_show_their_own_inliers(small_capture, drawn, tmp_path):

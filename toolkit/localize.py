@@ -140,8 +140,8 @@ def localize_pairs(
                     localized = run.localize(record, h5_attributes)
                     write_text(pair.map_record, json.dumps(run.map.record(), indent=1) + "\n")
                     write_sidecar(pair.map_record, stage.made_from(h5_attributes))
-                    localized.write(pair, settings)
-                    unfinished = localized.unfinished
+                    _write_poses(pair, localized, settings)
+                    unfinished = run.unfinished
                 if update_attributes(pair.file("h5"), h5_attributes) or not skipped:
                     maps = [stage.folders.map / name for name in json.loads(h5_attributes[MAPS])]
                     write_sidecar(
@@ -330,6 +330,8 @@ _Todo = tuple[str, str, int]
 """Name of a query's item, fingerprint of its sources, and number of the query."""
 _Task = tuple[int, QueryInput, Any, float]
 """Number of a query, the query, what is known of it (a prediction, or its first result), and seconds spent on it."""
+_Row = tuple[dict[str, Any], Floats, Floats]
+"""Row of a query in the table, its pose (4, 4) and covariance (6, 6), NaN if unknown."""
 _Results = dict[int, QueryResult]
 """Queries that failed with an internal error, by number. They get no item, so the next run tries them again."""
 _RETRIED = "/retried"
@@ -346,6 +348,8 @@ class _PairRun:
         self.rows = pair.session.rows_of_keyframes(keyframes)
         """For each query, the rows of its images."""
         self.stored = StoredQueries(pair.session, pair.retrieval)
+        self.unfinished = False
+        """Whether a query failed with an internal error."""
         if scene_map.settings.method not in WITHOUT_FEATURES:
             for kind in scene_map.kinds:
                 self._add_kind(kind, range(len(self.keys)))
@@ -382,8 +386,8 @@ class _PairRun:
     def query(self, number: int) -> QueryInput:
         return self.stored.query(self.map, self.rows[number])
 
-    def localize(self, record: dict[str, Any], h5_attributes: Mapping[str, str]) -> "_Localized":
-        """Localize the queries that are not localized yet, and write the `.h5` file."""
+    def localize(self, record: dict[str, Any], h5_attributes: Mapping[str, str]) -> "list[_Row]":
+        """Localize the queries that are not localized yet, and write the `.h5` file; return a row per query."""
         names, source = [query_group(*key) for key in self.keys], fingerprint(record)
         numbers = {name: number for number, name in enumerate(names)}  # a keyframe list may repeat a query
         with Items(self.pair.file("items"), again=not self.stage.skip_existing) as items:
@@ -401,20 +405,21 @@ class _PairRun:
         # If the run is killed before it writes the new poses, no poses of an earlier run may lie beside this file.
         for poses in (self.pair.file("txt"), sidecar_path(self.pair.file("txt"))):
             poses.unlink(missing_ok=True)
-        collected = _Localized(dict(zip(names, self.pair.session.own_names(self.rows), strict=True)), names)
+        self.unfinished = bool(faulty)
+        rows = dict[str, _Row]()
 
         def groups() -> Iterator[tuple[str, dict[str, Any]]]:
             for name, number in numbers.items():
                 if number in faulty:
                     row, arrays = faulty[number].to_row(*self.keys[number]), faulty[number].arrays()
-                    collected.unfinished = True
                 else:
                     row, arrays = items.note(last[name]), items[last[name]] or items[name]
-                collected.add(name, row, arrays)
+                rows[name] = row, arrays["world_from_rig"], arrays["covariance"]
                 yield name, arrays
 
         write_groups(self.pair.file("h5"), groups(), h5_attributes)
-        return collected
+        images = self.pair.session.own_names(self.rows)
+        return [(rows[name][0] | {"image": image}, *rows[name][1:]) for name, image in zip(names, images, strict=True)]
 
     @property
     def devices(self) -> tuple[str, str]:
@@ -533,37 +538,22 @@ def _retry_share(
     run.retry_into(items, todo, shared)
 
 
-class _Localized:
-    """The table and the poses of a pair, collected while its correspondences are written."""
-
-    def __init__(self, images: Mapping[str, str], names: Sequence[str]) -> None:
-        """Take the name of each query's first image by the name of its item, and the names in the table's order."""
-        self._images, self._names = images, names
-        self._rows: dict[str, tuple[dict[str, Any], Floats, Floats]] = {}
-        self.unfinished = False
-        """Whether a query failed with an internal error."""
-
-    def add(self, name: str, row: dict[str, Any], arrays: Mapping[str, Any]) -> None:
-        """Take the row of a query, and its pose and covariance from its arrays."""
-        self._rows[name] = row | {"image": self._images[name]}, arrays["world_from_rig"], arrays["covariance"]
-
-    def write(self, pair: _Pair, settings: LocalizeSettings) -> None:
-        """Write table and poses; the poses last, because their file marks the pair as finished."""
-        columns = [*COLUMNS, *(PREDICTION_COLUMNS if settings.predicts else [])]
-        columns += FALLBACK_COLUMNS if settings.features.escalation else []
-        results = [self._rows[name] for name in self._names]
-        table = pd.DataFrame([row for row, _, _ in results], columns=columns)
-        with write_atomic(pair.file("csv")) as temporary:
-            in_unit_of_poses(table, settings.unit).to_csv(temporary, index=False)
-        posed = [result for result in results if np.isfinite(result[1]).all()]
-        covariances = np.array([covariance for _, _, covariance in posed]).reshape(-1, 6, 6)
-        trajectory = Trajectory(
-            np.array([row["timestamp"] for row, _, _ in posed], np.int64),
-            [row["device_id"] for row, _, _ in posed],
-            np.array([qt_from_pose(pose) for _, pose, _ in posed], np.float64).reshape(-1, 7),
-            None if np.isnan(covariances).all() else covariances,
-        )
-        trajectory.write(pair.file("txt"))
+def _write_poses(pair: _Pair, rows: Sequence[_Row], settings: LocalizeSettings) -> None:
+    """Write the table and the poses of a pair; the poses last, because their file marks the pair as finished."""
+    columns = [*COLUMNS, *(PREDICTION_COLUMNS if settings.predicts else [])]
+    columns += FALLBACK_COLUMNS if settings.features.escalation else []
+    table = pd.DataFrame([row for row, _, _ in rows], columns=columns)
+    with write_atomic(pair.file("csv")) as temporary:
+        in_unit_of_poses(table, settings.unit).to_csv(temporary, index=False)
+    posed = [row for row in rows if np.isfinite(row[1]).all()]
+    covariances = np.array([covariance for _, _, covariance in posed]).reshape(-1, 6, 6)
+    trajectory = Trajectory(
+        np.array([row["timestamp"] for row, _, _ in posed], np.int64),
+        [row["device_id"] for row, _, _ in posed],
+        np.array([qt_from_pose(pose) for _, pose, _ in posed], np.float64).reshape(-1, 7),
+        None if np.isnan(covariances).all() else covariances,
+    )
+    trajectory.write(pair.file("txt"))
 
 
 def explain_query(

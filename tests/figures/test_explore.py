@@ -49,7 +49,7 @@ def test_odometry_and_radio_are_told(small_capture: Path, tmp_path: Path) -> Non
 
 def test_queries_without_inliers_are_at_the_left_edge(tmp_path: Path) -> None:
     path = tmp_path / "PLACE_map_ios_query_hl.csv"
-    path.write_text("status,num_inliers\nlow_confidence,0\nok,40\n")
+    path.write_text("timestamp,device_id,status,num_inliers\n1,hl,low_confidence,0\n2,hl,ok,40\n")
     (plot,) = draw_statuses([path]).axes
     assert plot.get_xlim()[0] == 0.5 == min(x for dots in plot.collections for x, _ in dots.get_offsets())
     assert [label.get_text() for label in plot.get_yticklabels()] == ["hl in ios map"]

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from tests.displayed import picture_of
-from tests.localized import some_correspondences, write_pair
+from tests.localized import some_correspondences, stored, write_pair
 from tests.rendered import LIST, copy_shared, write_retrieval
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, ManifestError
@@ -23,7 +23,7 @@ from toolkit.files import SceneFiles, map_record_path
 from toolkit.geometry import invert
 from toolkit.localize import localize_pairs
 from toolkit.manifest import LocalizeSettings
-from toolkit.pose.correspondences import LocalizedQuery, Rival
+from toolkit.pose.result import CAMERA, QueryResult, Rival, Status
 
 
 @pytest.fixture(scope="module")
@@ -50,12 +50,12 @@ def pair(files: SceneFiles) -> InspectedPair:
 
 
 def written(
-    capture: Path, folder: Path, queries: list[LocalizedQuery], device: str = "ios", **columns: object
+    capture: Path, folder: Path, queries: list[QueryResult], device: str = "ios", **columns: object
 ) -> InspectedPair:
     """A pair written by hand, its attributes like those of a run."""
     import h5py
 
-    from toolkit.scene.map import RETRIEVAL, SESSIONS_ROOT, SETTINGS
+    from toolkit.scene.opening import RETRIEVAL, SESSIONS_ROOT, SETTINGS
 
     poses = folder / capture.name / "poses"
     stem = write_pair(Capture.open(capture), poses, "ios", device, queries, **columns)  # type: ignore[arg-type]
@@ -77,20 +77,21 @@ def panel(figure: object, title: str) -> object:
 def test_it_shows_what_the_stage_stored(files: SceneFiles, pair: InspectedPair) -> None:
     one = inspect_query(files.run, files.scene, "ios", "spot", 1)
     row = pd.read_csv(files.poses_csv("ios", "spot")).iloc[1]
-    stored = pair.localized.queries[int(row["timestamp"]), row["device_id"]]
-    assert one.status == row["status"]
+    stored = pair.localized.results[1]
+    assert one.result.status_text == row["status"]
     assert one.numbers["num_inliers"] == row["num_inliers"]
     assert one.matches["agree"].sum() == stored.correspondences.inlier.sum() > 0
     assert one.matches.to_numpy().sum() == len(stored.correspondences)
-    assert one.error[1] == pytest.approx(np.linalg.norm((invert(one.pose) @ one.true_pose)[:3, 3])), "of the rig"
-    assert one.references["name"][one.references["used"]].tolist() == stored.references
+    off = invert(one.result.world_from_rig) @ one.true_pose
+    assert one.error[1] == pytest.approx(np.linalg.norm(off[:3, 3])), "of the rig"
+    assert one.references["name"][one.references["used"]].tolist() == list(stored.references)
     ranked = one.references.dropna(subset="rank")
     assert ranked["rank"].min() == 1
     assert ranked.sort_values("rank")["score"].notna().all()
     shown = text_of(one.figure)
     for kind, counts in one.matches.iterrows():
         assert counts["agree"] == 0 or f"{str(kind).replace('/', ', ')}: {counts['agree']} agree" in shown
-    assert one.status in shown
+    assert one.result.status_text in shown
     assert f"\n{one.name.partition('/raw_data/')[2]}\n" in shown
     assert f"{row['num_inliers']}" in shown
     assert one.texts["true position error [m]"].strip("0.")
@@ -101,22 +102,22 @@ def test_it_shows_what_the_stage_stored(files: SceneFiles, pair: InspectedPair) 
 def test_unchanged_settings_give_the_same_pose_and_others_are_shown_beside(pair: InspectedPair) -> None:
     one = pair.look(0)
     same = one.again()
-    assert same.after.pose is not None
-    np.testing.assert_allclose(same.after.pose, one.pose, atol=1e-12)
-    np.testing.assert_allclose(same.after.covariance, one.covariance, rtol=1e-9)
-    assert same.after.status == one.status
-    assert len(same.after.correspondences) == len(one.correspondences)
-    assert (same.after.rivals, one.rivals) == ((), ())
+    assert same.after.result.world_from_rig is not None
+    np.testing.assert_allclose(same.after.result.world_from_rig, one.result.world_from_rig, atol=1e-12)
+    np.testing.assert_allclose(same.after.result.covariance, one.result.covariance, rtol=1e-9)
+    assert same.after.result.status_text == one.result.status_text
+    assert len(same.after.result.correspondences) == len(one.result.correspondences)
+    assert (same.after.result.rivals, one.result.rivals) == ((), ())
     strict = one.again({"pnp": {"min_inliers": 5000}})
-    assert strict.after.status.startswith("failed: too few inliers")
+    assert strict.after.result.reason.startswith("too few inliers")
     assert "at least 5000 are required" in strict.after.reason
     assert strict.before is one
-    assert strict.table.loc["status"].tolist() == [one.status, strict.after.status]
+    assert strict.table.loc["status"].tolist() == [one.result.status_text, strict.after.result.status_text]
     assert picture_of(strict).width > 800
     nearest = one.again({"method": "nearest"})
-    assert nearest.after.method == "nearest"
+    assert nearest.after.result.found_by == "nearest"
     first = one.references[one.references["rank"] == 1]  # one of each camera of the rig
-    assert nearest.after.localized.references == [first["name"][first["score"].idxmax()]]
+    assert list(nearest.after.result.references) == [first["name"][first["score"].idxmax()]]
     alone = text_of(nearest.after.figure)
     assert "true position error" in alone
     assert not any(text in alone for text in ("inliers", "descriptor matches", "image covered")), "it has none"
@@ -128,7 +129,7 @@ def test_unchanged_settings_give_the_same_pose_and_others_are_shown_beside(pair:
 
 def test_the_worst_is_the_worst(small_capture: Path, tmp_path: Path) -> None:
     off = [0.0, 0.3, 0.02]
-    pair = written(small_capture, tmp_path, [LocalizedQuery()] * 3, off_m=off)
+    pair = written(small_capture, tmp_path, [stored()] * 3, off_m=off)
     assert pair.look("worst").number == 1
     assert pair.look(1).error[1] == pytest.approx(0.3)
     worst = WorstQueries(pair._h5.parent)
@@ -142,8 +143,8 @@ def test_the_worst_is_the_worst(small_capture: Path, tmp_path: Path) -> None:
 def test_a_session_that_broke_after_a_run_costs_only_its_own_pairs(small_capture: Path, tmp_path: Path) -> None:
     capture = tmp_path / "capture" / small_capture.name
     shutil.copytree(small_capture, capture)
-    written(capture, tmp_path, [LocalizedQuery()] * 2)
-    pair = written(capture, tmp_path, [LocalizedQuery()], device="hl")
+    written(capture, tmp_path, [stored()] * 2)
+    pair = written(capture, tmp_path, [stored()], device="hl")
     (capture / "sessions" / "hl_query" / "images.txt").write_text("a line\n")
     worst = WorstQueries(pair._h5.parent)
     assert [name.partition(":")[0] for name in worst.names] == ["ios in the map of ios"] * 2
@@ -152,9 +153,9 @@ def test_a_session_that_broke_after_a_run_costs_only_its_own_pairs(small_capture
 def test_a_failed_query_says_why_and_is_drawn(small_capture: Path, tmp_path: Path) -> None:
     status = ["failed: too few inliers (4 within 0.45 deg)", "failed: no references"]
     counts = {"num_inliers": [4, 0], "num_matches": [9, 0]}
-    pair = written(small_capture, tmp_path, [LocalizedQuery()] * 2, status=status, **counts)
+    pair = written(small_capture, tmp_path, [stored()] * 2, status=status, **counts)
     one = pair.look(0)
-    assert one.pose is None
+    assert one.result.world_from_rig is None
     assert one.error is None
     assert all(count in one.reason for count in ("4 within 0.45 deg", "9 matches", "at least 12"))
     assert "no pose" in text_of(one.figure)
@@ -168,7 +169,7 @@ def test_rivals_are_drawn_where_they_are(small_capture: Path, tmp_path: Path) ->
     pose = session.world_from_cam([0], ground_truth=True)[0].copy()
     pose[:3, 3] += [0.5, 0.0, 0.0]
     found = some_correspondences([0] * 6, [True, False, True, True, False, True])
-    query = LocalizedQuery([session.image_name(0)], [], [], found, (Rival(pose, 0.93),))
+    query = stored([session.image_name(0)], [], [], found, (Rival(pose, 0.93),))
     one = written(small_capture, tmp_path, [query]).look(0)
     drawn = {each.get_label(): each.get_offsets() for each in panel(one.figure, "from above").collections}
     np.testing.assert_allclose(drawn["rival, 93% of the support"], [pose[:2, 3]], atol=1e-9)
@@ -181,10 +182,10 @@ def test_the_ellipse_is_of_the_camera_not_of_the_rig(pair: InspectedPair) -> Non
     names = [one.pair.query_session.image_name(int(row)) for row in one.pair.rows[0]]
     camera = names.index(one.details.cameras[0].name)
     rng = np.random.default_rng(0)
-    moves = rng.multivariate_normal(np.zeros(6), one.covariance, 20_000)
+    moves = rng.multivariate_normal(np.zeros(6), one.result.covariance, 20_000)
     at = rig_from_cam[camera][:3, 3]
     places = at + moves[:, 3:] + np.cross(moves[:, :3], at)
-    expected = np.cov((places @ one.pose[:3, :3].T).T)
+    expected = np.cov((places @ one.result.world_from_rig[:3, :3].T).T)
     covariance = _position_covariance(one, rig_from_cam[camera])
     np.testing.assert_allclose(covariance, expected, atol=0.05 * np.abs(expected).max())
 
@@ -192,8 +193,8 @@ def test_the_ellipse_is_of_the_camera_not_of_the_rig(pair: InspectedPair) -> Non
 def test_both_answers_are_drawn_at_the_same_camera_of_a_rig(pair: InspectedPair) -> None:
     one = pair.look(0)
     other = next(image.name for image in one.details.cameras if image.name != one.details.cameras[0].name)
-    found = some_correspondences([one.localized.images.index(other)] * 6, [True] * 6)
-    swapped = replace(one, localized=replace(one.localized, correspondences=found))
+    found = some_correspondences([one.result.images.index(other)] * 6, [True] * 6)
+    swapped = replace(one, result=replace(one.result, correspondences=found))
     assert swapped.details.cameras[0].name == other
     first, second = panel(Comparison(one, swapped, {}).figure, "the pose, enlarged").patches
     np.testing.assert_allclose(second.get_center(), first.get_center(), atol=1e-9)
@@ -201,12 +202,14 @@ def test_both_answers_are_drawn_at_the_same_camera_of_a_rig(pair: InspectedPair)
 
 def test_lengths_of_an_unknown_unit_are_not_meters(small_capture: Path, tmp_path: Path) -> None:
     off = [0.0, 0.3, 0.02]
-    pair = written(small_capture, tmp_path, [LocalizedQuery()] * 3, off_m=off, position_std_m=[0.01, 0.2, 0.03])
+    pair = written(small_capture, tmp_path, [stored()] * 3, off_m=off, position_std_m=[0.01, 0.2, 0.03])
     poses = pair._h5.parent
     map_record_path(poses, small_capture.name, "ios").write_text(json.dumps({"unit": None, "depth": 50.0, "text": ""}))
     pair = InspectedPair("ios", "ios", poses)
     one = pair.look("worst")
     assert one.error[1] == pytest.approx(0.06)
+    spread = np.diag([0.0, 0.0, 0.0, 0.2**2, 0.0, 0.0])
+    one = replace(one, result=replace(one.result, covariance=spread))
     assert one.numbers["position_std_m"] == pytest.approx(0.04)
     text = text_of(one.figure)
     assert "std. dev. of position [L]" in text
@@ -245,9 +248,11 @@ def test_names_and_numbers_that_are_none_are_refused(files: SceneFiles, pair: In
 
 def test_an_estimate_in_doubt_says_why() -> None:
     numbers = {"num_inliers": 20, "num_matches": 80, "inlier_ratio": 0.25, "coverage": 0.2, "p_correct": 0.7}
-    words = reason_in_words("low_confidence", "", numbers | {"rival_support": 0.93}, LocalizeSettings())
+    unsure = QueryResult(Status.LOW_CONFIDENCE)
+    words = reason_in_words(unsure, numbers | {"rival_support": 0.93}, LocalizeSettings())
     assert all(share in words for share in ("70%", "99%", "93%")), "its probability, the limit, and the rival"
-    camera = reason_in_words("low_confidence: camera?", "the focal length is 500 px", numbers, LocalizeSettings())
+    contradicted = replace(unsure, reason=CAMERA, remark="the focal length is 500 px")
+    camera = reason_in_words(contradicted, numbers, LocalizeSettings())
     assert camera.endswith("The focal length is 500 px.")
 
 

@@ -19,6 +19,7 @@ import numpy as np
 import pycolmap
 from PIL import Image
 
+from tests.localized import read_queries, stored
 from toolkit.capture import Capture, Session
 from toolkit.capture.check import check_capture
 from toolkit.capture.tables import read_query_table
@@ -28,7 +29,7 @@ from toolkit.exchange.hloc import import_features
 from toolkit.exchange.interchange import import_colmap, import_images
 from toolkit.files import read_references
 from toolkit.manifest import load_manifest
-from toolkit.pose.correspondences import Correspondences, LocalizedQueries, LocalizedQuery
+from toolkit.pose.result import Correspondences, QueryResult
 from toolkit.store.hdf5 import write_groups
 
 
@@ -179,12 +180,12 @@ HDF5_ARRAYS = (
 )  # fmt: skip
 
 
-def localized_query() -> LocalizedQuery:
+def localized_query() -> QueryResult:
     found = Correspondences(
         np.zeros(3, np.int64), np.ones((3, 2)), np.ones((3, 3)), np.arange(3), np.ones(3, bool),
         np.array(["sift/guided"] * 3), np.arange(3), np.zeros(3, np.int64), np.ones((3, 2)),
     )  # fmt: skip
-    return LocalizedQuery(["q/1.png"], ["m/1.png"], [], found)
+    return stored(["q/1.png"], ["m/1.png"], [], found)
 
 
 def write_queries(path: Path) -> bytes:
@@ -290,17 +291,12 @@ def check_hdf5(data: bytes) -> None:
 
 
 def use_queries(path: Path) -> None:
-    queries = LocalizedQueries(path)
-    try:
-        for key in [*queries, (10, "rig"), (20, "rig")]:
-            if key in queries:
-                check_query(queries[key])
-        len(queries)
-    finally:
-        queries.close()
+    read = read_queries(path)
+    for key in ((10, "rig"), (20, "rig")):
+        check_query(read(*key))
 
 
-def check_query(query: LocalizedQuery) -> None:
+def check_query(query: QueryResult) -> None:
     """What readers rely on."""
     found = query.correspondences
     count, views = len(found.camera), len(found.view_of)

@@ -195,7 +195,7 @@ def test_a_query_in_a_tiled_map_without_points_has_too_few_matches(tmp_path: Pat
     assert_equal(opened, street.triangulate(np.arange(4)))  # the map in one piece
     features = LocalFeatures(pixels, *np.ones((2, 50), np.float32), np.eye(50, 128, dtype=np.float16), (640, 480))
     localizer = PnpLocalizer([MappedFeatures(opened, dict.fromkeys(street.names, features))])
-    assert ask(localizer, [street.camera], np.eye(4)[None], [features], [range(4)]).status == "failed: too few matches"
+    assert ask(localizer, [street.camera], np.eye(4)[None], [features], [range(4)]).reason == "too few matches"
 
 
 # -------------------------------------------------------------------------------------------------------- photographs

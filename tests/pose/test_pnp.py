@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tests.queries import ask, rests_on
+from tests.queries import ask, indices_of, rests_on
 from toolkit import geometry
 from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, LocalFeatures
 from toolkit.features.matching import MutualMatcher, PairMatches, unit_descriptors
@@ -20,9 +20,10 @@ from toolkit.manifest import PnpSettings
 from toolkit.mapping.local_map import LocalMap
 from toolkit.pose import map_matching as matches
 from toolkit.pose import pnp
-from toolkit.pose.base import CAMERA, PoseEstimate, Prior
+from toolkit.pose.base import Prior
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import FIRST_REFERENCES, GUIDED_WEIGHT, VIEWS, PnpLocalizer, _Hypothesis
+from toolkit.pose.result import CAMERA, QueryResult
 from toolkit.pose.rig import Matches, RigQuery, least_squares_covariance
 
 Floats = NDArray[np.float64]
@@ -157,7 +158,7 @@ def room() -> World:
 
 
 def check(
-    estimate: PoseEstimate, true: Floats, max_deg: float = 0.1, max_m: float = 0.01, status: str = "ok"
+    estimate: QueryResult, true: Floats, max_deg: float = 0.1, max_m: float = 0.01, status: str = "ok"
 ) -> None:
     assert estimate.status == status
     assert estimate.world_from_rig is not None
@@ -175,7 +176,7 @@ def test_a_single_camera(room: World, model: str) -> None:
     assert estimate.num_matches >= estimate.num_inliers
     assert 0 < estimate.inlier_ratio <= 1
     assert 0.4 < estimate.rmse_px < 0.9  # of 0.5 px a coordinate
-    assert set(estimate.references) <= set(REFERENCES)
+    assert set(indices_of(estimate.references)) <= set(REFERENCES)
     # What the pose rests on can be looked at: those points, projected, are those pixels.
     _, pixels, point_index = rests_on(estimate)
     assert len(pixels) == estimate.num_guided
@@ -201,10 +202,10 @@ def test_a_wrong_focal_length_is_doubted_and_its_deviation_is_honest(room: World
     camera = CAMERAS[model]
     seen = room.look(camera, QUERY)
     estimate = ask(room.localizer(), [wrong(camera, 1.1)], np.eye(4)[None], [seen], [REFERENCES])
-    assert estimate.status == CAMERA
+    assert estimate.reason == CAMERA
     assert estimate.misfit
     assert estimate.focals_px == pytest.approx([camera.mean_focal_length()], rel=0.01)
-    assert "the focal length that fits" in estimate.reason
+    assert "the focal length that fits" in estimate.remark
     assert estimate.world_from_rig is not None
     error_m = float(geometry.pose_error(estimate.world_from_rig, QUERY)[1])
     assert error_m > 0.1
@@ -234,7 +235,7 @@ def test_of_a_rig_the_wrong_camera_is_named_by_its_place_among_the_images(room: 
     features: list = [room.look(c, QUERY @ r) for c, r in zip(RIG_CAMERAS, RIG_FROM_CAMS, strict=True)]
     cameras = [RIG_CAMERAS[0], wrong(RIG_CAMERAS[1], 0.9), RIG_CAMERAS[2]]
     estimate = ask(room.localizer(), cameras, RIG_FROM_CAMS, ["unreadable", *features[1:]], [REFERENCES] * 3)
-    assert estimate.status == CAMERA
+    assert estimate.reason == CAMERA
     assert np.isnan(np.array(estimate.focals_px)[[0, 2]]).all()
     assert estimate.focals_px[1] == pytest.approx(PINHOLE.mean_focal_length(), rel=0.01)
 
@@ -279,7 +280,7 @@ def test_points_on_one_plane() -> None:
 def test_no_references(room: World) -> None:
     seen = room.look(PINHOLE, QUERY)
     estimate = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [[]])
-    assert estimate.status == "failed: no references"
+    assert estimate.status_text == "failed: no references"
     assert estimate.world_from_rig is None
     assert estimate.covariance is None
     assert (estimate.num_matches, estimate.num_inliers, estimate.inlier_ratio) == (0, 0, 0.0)
@@ -290,7 +291,7 @@ def test_no_references(room: World) -> None:
 def test_too_few_matches(room: World, count: int) -> None:
     seen = room.look(PINHOLE, QUERY, limit=count)
     estimate = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
-    assert estimate.status == "failed: too few matches"
+    assert estimate.status_text == "failed: too few matches"
     assert estimate.world_from_rig is None
     assert estimate.num_matches <= count * len(REFERENCES)
 
@@ -302,7 +303,7 @@ def test_eight_matches_are_no_pose(room: World, rig: bool) -> None:
     poses = RIG_FROM_CAMS if rig else np.eye(4)[None]
     features = [room.look(c, QUERY @ p, limit=8 // len(cameras)) for c, p in zip(cameras, poses, strict=True)]
     estimate = ask(room.localizer(), cameras, poses, features, [REFERENCES] * len(cameras))
-    assert estimate.status.startswith("failed: ")
+    assert estimate.status_text.startswith("failed: ")
     assert estimate.world_from_rig is None
 
 
@@ -361,7 +362,7 @@ def test_a_map_image_without_points_does_no_harm(room: World) -> None:
     seen = world.look(PINHOLE, QUERY)
     check(ask(world.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES]), QUERY)
     alone = ask(world.localizer(), [PINHOLE], np.eye(4)[None], [seen], [[0, 1]])
-    assert alone.status == "failed: too few matches"
+    assert alone.status_text == "failed: too few matches"
 
 
 @pytest.mark.parametrize(("seed", "limit", "outliers"), [(0, 120, 0.85), (4, 80, 0.8), (5, 120, 0.85)])
@@ -619,7 +620,7 @@ def test_localizing_leaves_the_map_as_it_is(room: World) -> None:
 # ------------------------------------------------------------------------------------------- what a pose rests on
 
 
-def errors_deg(points: Floats, estimate: PoseEstimate, cameras: list[pycolmap.Camera], rig_from_cams: Floats) -> Floats:
+def errors_deg(points: Floats, estimate: QueryResult, cameras: list[pycolmap.Camera], rig_from_cams: Floats) -> Floats:
     """Return how far each correspondence's point is projected from its pixel, as an angle; inf behind the camera."""
     matches, errors = estimate.correspondences, np.full(len(estimate.correspondences), np.inf)
     np.testing.assert_array_equal(matches.points, points[matches.point_index])
@@ -669,7 +670,7 @@ def test_views_are_the_keypoints_of_references_that_see_the_points(room: World, 
     asked = rig_asked(room) if rig else ([PINHOLE], np.eye(4)[None], [room.look(PINHOLE, QUERY)], [REFERENCES])
     estimate = ask(room.localizer(), *asked)
     matches = estimate.correspondences
-    shown = estimate.references[: matches.view_reference.max() + 1]
+    shown = indices_of(estimate.references)[: matches.view_reference.max() + 1]
     assert len(shown) == VIEWS
     for rank, image in enumerate(shown):
         keypoint, point = room.local_map.observations(image)
@@ -686,9 +687,10 @@ def test_references_that_see_the_most_come_first(room: World) -> None:
     seen_by = {index: np.arange(60 * index) for index in REFERENCES}
     world = World.build(room.points, MAP_POSES, room.descriptors, sees=seen_by)
     estimate = ask(world.localizer(), [PINHOLE], np.eye(4)[None], [world.look(PINHOLE, QUERY)], [REFERENCES])
-    assert set(estimate.references) == set(REFERENCES[1:])
+    used = indices_of(estimate.references)
+    assert set(used) == set(REFERENCES[1:])
     counts = [np.isin(rests_on(estimate)[2], world.local_map.observations(index)[1]).sum() for index in REFERENCES]
-    assert [counts[index] for index in estimate.references] == sorted(counts[1:], reverse=True)
+    assert [counts[index] for index in used] == sorted(counts[1:], reverse=True)
 
 
 def test_without_a_pose_all_matches_are_rejected(room: World) -> None:
@@ -696,7 +698,7 @@ def test_without_a_pose_all_matches_are_rejected(room: World) -> None:
     matches = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [[4]]).correspondences
     few = room.look(PINHOLE, QUERY, limit=3)
     estimate = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [few], [REFERENCES])
-    assert estimate.status == "failed: too few matches"
+    assert estimate.status_text == "failed: too few matches"
     for rejected in (matches, estimate.correspondences):
         assert len(rejected)
         assert not rejected.inlier.any()
@@ -709,11 +711,11 @@ def test_images_without_features_are_left_out_and_the_others_keep_their_numbers(
     estimate = ask(room.localizer(), cameras, poses, ["torn", *features[1:]], references)
     check(estimate, QUERY)
     assert set(estimate.correspondences.camera) == {1, 2}
-    assert estimate.reason == "torn"
+    assert estimate.remark == "torn"
     errors = errors_deg(room.points, estimate, cameras, poses)
     assert (errors[estimate.correspondences.inlier] < 1.2 * room.localizer().settings.max_error_deg).all()
     none = ask(room.localizer(), cameras, poses, ["torn", "no features", "torn"], references)
-    assert none.status == "failed: no readable image (torn; no features; torn)"
+    assert none.status_text == "failed: no readable image (torn; no features; torn)"
     assert none.world_from_rig is None
 
 
@@ -765,7 +767,7 @@ def test_several_kinds_of_features_give_one_pose_with_the_matches_of_all(room: W
     # And so are the places where references show them.
     for rank in np.unique(matches.view_reference):
         mine = matches.view_reference == rank
-        cam_from_world = geometry.invert(MAP_POSES[estimate.references[rank]])
+        cam_from_world = geometry.invert(MAP_POSES[indices_of(estimate.references)[rank]])
         in_cam = geometry.transform(cam_from_world, matches.points[matches.view_of[mine]])
         np.testing.assert_allclose(PINHOLE.img_from_cam(in_cam), matches.view_pixels[mine], atol=0.01)
     projected = PINHOLE.img_from_cam(geometry.transform(geometry.invert(QUERY), both.map.points[point_index]))

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from tests.rendered import LIST, LOW, World, run_stage
 from toolkit import geometry
-from toolkit import localize as localize_stage
 from toolkit.capture import Capture, Trajectory
 from toolkit.errors import ImageError, ManifestError, WeightsError
 from toolkit.figures.prediction import draw_prediction
 from toolkit.figures.style import save_figure
 from toolkit.files import SceneFiles
 from toolkit.localize import COLUMNS, PREDICTION_COLUMNS
-from toolkit.pose.base import PoseEstimate, QueryInput, References, View
+from toolkit.pose.base import QueryInput, References, View
+from toolkit.pose.result import QueryResult
 from toolkit.prediction.feed_forward import (
     MAX_DEPTH_POINTS,
     FeedForwardAnswer,
@@ -103,9 +103,9 @@ def test_a_network_sees_a_wrong_camera(world: World, factors: tuple[float, float
     predictor.focal_factors = factors
     for (query, _), answer in zip(queries, answers_of(world.localizer(predictor), queries), strict=True):
         estimate, focal_px = answer.estimate, query.views[0].camera.mean_focal_length()
-        assert estimate.status == ("ok" if sees is None else "low_confidence: camera?")
+        assert estimate.status_text == ("ok" if sees is None else "low_confidence: camera?")
         assert estimate.focals_px == (() if sees is None else (pytest.approx(sees * focal_px),))
-        assert ("sees a focal length" in estimate.reason) == (sees is not None)
+        assert ("sees a focal length" in estimate.remark) == (sees is not None)
 
 
 def test_wrong_references_are_left_out(world: World) -> None:
@@ -121,7 +121,7 @@ def test_wrong_references_are_left_out(world: World) -> None:
             assert not set(answer.estimate.rejected) & set(answer.estimate.references)
             wrong += answer.estimate.status == "ok" and (found[0] > 5 or found[1] > 0.5)
             if answer.estimate.rejected:
-                assert "contradict" in answer.estimate.reason
+                assert "contradict" in answer.estimate.remark
     assert right >= 7
     assert rejected >= 9
     assert wrong == 0
@@ -161,7 +161,7 @@ def test_an_unknown_scale_is_never_ok(world: World) -> None:
             assert np.isinf(answer.estimate.position_std_m)
             assert error < 3
             assert np.linalg.norm(answer.estimate.world_from_rig[:3, 3] - places[0, :3, 3]) < 2
-        assert answers[0].estimate.reason
+        assert answers[0].estimate.remark
 
 
 def test_depth_of_the_map_gives_the_scale_that_baselines_do_not(world: World) -> None:
@@ -251,7 +251,7 @@ def test_one_bad_query_is_a_failed_answer_and_the_others_go_on(world: World, how
     predictor = Failing(world.sessions, world.files.maps, **LOW)  # type: ignore[arg-type]
     predictor.bad, predictor.how = queries[1][0].views[0].name, how
     answers = answers_of(world.localizer(predictor), queries)
-    assert answers[1].estimate.status == reason
+    assert answers[1].estimate.status_text == reason
     assert answers[1].estimate.world_from_rig is None
     for index in (0, 2):
         np.testing.assert_array_equal(answers[index].estimate.world_from_rig, good[index].estimate.world_from_rig)
@@ -305,13 +305,13 @@ def test_a_rig_goes_on_without_a_camera_that_fails(world: World) -> None:
     predictor.bad = queries[0][0].views[0].name
     (answer,) = answers_of(world.localizer(predictor), queries[:1])
     assert geometry.pose_error(answer.estimate.world_from_rig, true[0])[1] < 0.1
-    assert "RuntimeError: out of luck" in answer.estimate.reason
+    assert "RuntimeError: out of luck" in answer.estimate.remark
 
 
 def test_without_references_there_is_no_pose(world: World) -> None:
     ((query, _), *_), _ = world.queries("ios")
     (answer,) = answers_of(world.localizer(world.predictor()), [(query, [References.of([])])])
-    assert answer.estimate.status == "failed: no references"
+    assert answer.estimate.status_text == "failed: no references"
     assert world.localizer(world.predictor()).predict([]) == []
 
 
@@ -432,7 +432,7 @@ def test_a_killed_run_goes_on_where_it_was(
     run: SceneFiles, finished: SceneFiles, small_capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
-    predict, row = FeedForwardLocalizer.predict, localize_stage._row
+    predict, row = FeedForwardLocalizer.predict, QueryResult.to_row
     rows: list[object] = []
 
     def killed(*args: object) -> dict:
@@ -448,7 +448,7 @@ def test_a_killed_run_goes_on_where_it_was(
         return predict(self, queries)
 
     with monkeypatch.context() as patch:
-        patch.setattr(localize_stage, "_row", killed)
+        patch.setattr(QueryResult, "to_row", killed)
         with pytest.raises(KeyboardInterrupt):
             run_stage(small_capture, run, query_device="ios", predictor={"batch_size": 1})
     assert not run.poses_txt("ios", "ios").exists()
@@ -480,10 +480,10 @@ def test_a_prediction_is_drawn_and_labeled(world: World, tmp_path: Path) -> None
     figure = draw_prediction(localizer, queries[0][0], answer)
     assert save_figure(figure, tmp_path / "prediction.png").stat().st_size > 20_000
     assert figure.get_suptitle().startswith("SIMULATED, no result")
-    failed = FeedForwardAnswer(PoseEstimate("failed: no references"), ())
+    failed = FeedForwardAnswer(QueryResult.failed("no references"), ())
     assert "failed: no references" in draw_prediction(localizer, queries[0][0], failed).get_suptitle()
     undecided = replace(answer.cameras[0], reason="undecided")
-    failed = FeedForwardAnswer(PoseEstimate("failed: undecided"), (undecided,))
+    failed = FeedForwardAnswer(QueryResult.failed("undecided"), (undecided,))
     assert draw_prediction(localizer, queries[0][0], failed).get_suptitle().count("undecided") == 1
 
 
@@ -505,4 +505,4 @@ def test_wrong_weights_end_the_run_and_a_bad_image_does_not(world: World) -> Non
     with pytest.raises(WeightsError, match="of another network"):
         world.localizer(Refuses(WeightsError("of another network"))).predict(queries)
     answers = answers_of(world.localizer(Refuses(ImageError("torn.jpg"))), queries)
-    assert {answer.estimate.status for answer in answers} == {"failed: ImageError: torn.jpg"}
+    assert {answer.estimate.status_text for answer in answers} == {"failed: ImageError: torn.jpg"}

@@ -17,9 +17,10 @@ from toolkit.capture import Capture, Trajectory
 from toolkit.features.matching import MutualMatcher
 from toolkit.features.stores import extract_session
 from toolkit.files import SceneFiles
-from toolkit.pose.base import PoseEstimate, Prior, QueryInput
+from toolkit.pose.base import Prior, QueryInput, References
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer
+from toolkit.pose.result import QueryResult, Status
 from toolkit.prediction.feed_forward import FeedForwardAnswer
 from toolkit.prediction.hybrid import HybridLocalizer
 
@@ -45,15 +46,15 @@ def input_of(world: World, device: str, index: int) -> QueryInput:
 
 
 def localize_with(
-    hybrid: HybridLocalizer, query_input: QueryInput, predicted: PoseEstimate
-) -> PoseEstimate:
+    hybrid: HybridLocalizer, query_input: QueryInput, predicted: QueryResult
+) -> QueryResult:
     """Localize where the network gives this pose."""
     network = copy(hybrid.feed_forward)
     network.answer = lambda *_: FeedForwardAnswer(predicted)  # type: ignore[method-assign]
     return HybridLocalizer(hybrid.pnp, network).localize(*query_input)
 
 
-def same(one: PoseEstimate, other: PoseEstimate) -> bool:
+def same(one: QueryResult, other: QueryResult) -> bool:
     return (
         one.status == other.status
         and one.num_inliers == other.num_inliers
@@ -70,9 +71,9 @@ def test_without_a_usable_prediction_the_hybrid_is_pnp(
     query_input = input_of(world, device, 0)
     expected = pnp.localize(*query_input)
     assert expected.status == "ok"
-    assert same(localize_with(hybrid, query_input, PoseEstimate("failed: no references")), expected)
+    assert same(localize_with(hybrid, query_input, QueryResult.failed("no references")), expected)
     unknown = np.diag([1e-4] * 3 + [np.inf] * 3)
-    far = PoseEstimate("low_confidence", np.eye(4), unknown, found_by="feed_forward")
+    far = QueryResult(Status.LOW_CONFIDENCE, "", np.eye(4), unknown, found_by="feed_forward")
     assert same(localize_with(hybrid, query_input, far), expected)
 
 
@@ -83,17 +84,21 @@ def test_a_wrong_prediction_does_no_harm(
     query, references = input_of(world, device, 0)
     expected = pnp.localize(query, references)
     wrong = expected.world_from_rig @ geometry.make_pose(np.eye(3), [1.0, 0.5, 0.0])
-    prediction = predicted_at(wrong, references[0].images[:4])
+    prediction = predicted_at(wrong, names_of(world, references))
     assert same(localize_with(hybrid, (query, references), prediction), expected)
 
 
-def predicted_at(world_from_rig: Floats, references: Sequence[int]) -> PoseEstimate:
+def names_of(world: World, references: Sequence[References]) -> list[str]:
+    """Return the names of the first references of a query's first image."""
+    return [world.map.image_names[index] for index in references[0].images[:4]]
+
+
+def predicted_at(world_from_rig: Floats, references: Sequence[str]) -> QueryResult:
     covariance = np.diag([1e-4] * 3 + [1e-3] * 3)
-    rests_on = tuple(int(image) for image in references)
-    return PoseEstimate("ok", world_from_rig, covariance, references=rests_on, found_by="feed_forward")
+    return QueryResult(Status.OK, "", world_from_rig, covariance, references=tuple(references), found_by="feed_forward")
 
 
-def prediction_near(true: Floats, references: Sequence[int], seed: int = 0) -> PoseEstimate:
+def prediction_near(true: Floats, references: Sequence[str], seed: int = 0) -> QueryResult:
     rng = np.random.default_rng(seed)
     nearby = true @ geometry.make_pose(
         geometry.quaternion_to_rotation([1.0, *(rng.normal(size=3) * 0.004)]), rng.normal(size=3) * 0.02
@@ -104,7 +109,7 @@ def prediction_near(true: Floats, references: Sequence[int], seed: int = 0) -> P
 def test_a_prediction_finds_what_descriptors_alone_do_not(world: World, hybrid: HybridLocalizer) -> None:
     """Descriptors too alike to be matched in all of an image are matched about the predicted pose."""
     query, references = input_of(world, "ios", 0)
-    true, near = world.queries("ios")[1][0], references[0].images[:4]
+    true, near = world.queries("ios")[1][0], names_of(world, references)
     features = hybrid.pnp.matcher.mapped[0].features
     strict = PnpLocalizer([MappedFeatures(world.map, features, matcher=MutualMatcher(min_score=2.0))])
     alone = strict.localize(query, references)
@@ -123,12 +128,12 @@ def test_where_nothing_matches_the_prediction_is_the_answer(world: World, hybrid
     query, references = input_of(world, "ios", 0)
     blind = replace(query, features=[[kinds[0].take(slice(0))] for kinds in query.features])
     true = world.queries("ios")[1][0]
-    prediction = prediction_near(true, references[0].images[:4])
+    prediction = prediction_near(true, names_of(world, references))
     found = localize_with(hybrid, (blind, references), prediction)
     assert found.found_by == "feed_forward"
     assert found.status == "ok"
     np.testing.assert_array_equal(found.world_from_rig, prediction.world_from_rig)
-    assert "failed: too few matches" in found.reason
+    assert "failed: too few matches" in found.remark
 
 
 def test_a_hybrid_asks_its_network_where_no_prediction_is_given(world: World, hybrid: HybridLocalizer) -> None:

@@ -21,9 +21,10 @@ from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import SceneFiles, write_text
 from toolkit.localize import localize_pairs
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.base import PoseEstimate, Query, References, View
+from toolkit.pose.base import Query, References, View
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer
+from toolkit.pose.result import QueryResult
 from toolkit.prediction.feed_forward import FeedForwardAnswer, FeedForwardLocalizer, QueryPrediction
 from toolkit.prediction.hybrid import HybridLocalizer
 from toolkit.prediction.interface import Prediction
@@ -52,11 +53,11 @@ class World:
         localizer = FeedForwardLocalizer(self.map, session, predictor)  # type: ignore[arg-type]
         return localizer, localizer.answer(*self.queries[index])
 
-    def localize(self, index: int, predictor: object, session: Session) -> PoseEstimate:
+    def localize(self, index: int, predictor: object, session: Session) -> QueryResult:
         feed_forward = FeedForwardLocalizer(self.map, session, predictor)  # type: ignore[arg-type]
         return HybridLocalizer(self.pnp, feed_forward).localize(*self.queries[index])
 
-    def error(self, index: int, found: PoseEstimate) -> tuple[float, float]:
+    def error(self, index: int, found: QueryResult) -> tuple[float, float]:
         rotation_deg, distance_m = geometry.pose_error(found.world_from_rig, self.true[index])
         return float(rotation_deg), float(distance_m)
 
@@ -105,7 +106,7 @@ def world(small_capture: Path, small_features: Path, tmp_path_factory: pytest.Te
 
 @pytest.mark.parametrize("index", range(4))
 def test_depth_maps_localize_where_nothing_is_triangulated(world: World, index: int) -> None:
-    assert world.pnp.localize(*world.queries[index]).status == "failed: too few matches"
+    assert world.pnp.localize(*world.queries[index]).status_text == "failed: too few matches"
     found = world.localize(index, world.predictor, world.map_session)
     assert found.found_by == "lifted"
     assert found.status == "ok"
@@ -188,12 +189,12 @@ def test_a_wrong_scale_of_one_image_is_in_the_covariance(world: World) -> None:
 
 def test_without_depth_nothing_is_lifted(world: World) -> None:
     feed_forward, _ = world.answer(0, world.predictor, world.without_depth)
-    nothing = FeedForwardAnswer(PoseEstimate("failed: no references"))
+    nothing = FeedForwardAnswer(QueryResult.failed("no references"))
     query, references = world.queries[0]
     assert DepthLifter(world.pnp, feed_forward).localize(query, references, nothing) is None
     untold = QueryPrediction((np.zeros(0, np.int64),) * len(query.views), ("no references",) * len(query.views))
     found = HybridLocalizer(world.pnp, feed_forward).localize(query, references, untold)
-    assert found.status == "failed: too few matches"
+    assert found.status_text == "failed: too few matches"
 
 
 def test_a_map_of_one_photograph_localizes_what_looks_like_it(

@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.localized import instants, some_correspondences, write_pair, write_queries
+from tests.localized import instants, some_correspondences, stored, write_pair, write_queries
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError
 from toolkit.figures.stills import draw_localization
 from toolkit.files import write_sidecar
 from toolkit.geometry import make_pose
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.correspondences import LocalizedQuery
+from toolkit.results import images
 from toolkit.results import pair as localized
 from toolkit.results.images import LocalizedPair, sure_points
 from toolkit.results.pair import load_maps, map_files
@@ -55,13 +55,13 @@ def drawn(axis):
 @pytest.mark.parametrize("point_index", [None, -1])  # -1: lifted points, which no map holds
 def test_a_single_camera_shows_its_inliers_and_where_its_references_see_them(capture, open_pair, point_index):
     found = some_correspondences([0] * 6, INLIERS, point_index=point_index)
-    query = LocalizedQuery(query_images(capture, "ios"), names(capture["ios_map"], 2), [], found)
+    query = stored(query_images(capture, "ios"), names(capture["ios_map"], 2), [], found)
     details = open_pair("ios", query).details(0)
     (camera,) = details.cameras
     np.testing.assert_array_equal(camera.pixels, found.pixels)
     np.testing.assert_allclose(camera.points, found.points)
     assert camera.inlier.tolist() == INLIERS
-    assert [image.name for image in details.references] == query.references
+    assert [image.name for image in details.references] == list(query.references)
     second = details.references[1]
     assert second.matches.tolist() == [0, 2, 4]
     np.testing.assert_array_equal(second.pixels, found.view_pixels[found.view_reference == 1])
@@ -79,7 +79,7 @@ def test_a_single_camera_shows_its_inliers_and_where_its_references_see_them(cap
 def test_a_rig_shows_the_camera_with_the_most_inliers_first(capture, open_pair):
     images = query_images(capture, "hl")
     found = some_correspondences([0, 0, 0, 1, 1, 1], [True, False, False, True, True, True])
-    details = open_pair("hl", LocalizedQuery(images[::-1], names(capture["ios_map"], 1), [], found)).details(0)
+    details = open_pair("hl", stored(images[::-1], names(capture["ios_map"], 1), [], found)).details(0)
     assert [camera.name for camera in details.cameras[:2]] == [images[-2], images[-1]]
     assert [camera.num_inliers for camera in details.cameras[:2]] == [3, 1]
     np.testing.assert_array_equal(details.cameras[0].pixels, found.pixels[3:])
@@ -94,9 +94,10 @@ def test_a_rig_shows_the_camera_with_the_most_inliers_first(capture, open_pair):
 
 
 def test_errors_are_those_of_the_device_as_in_the_evaluation(capture, open_pair):
-    pair = open_pair("hl", LocalizedQuery(query_images(capture, "hl"), names(capture["ios_map"], 1)))
+    pair = open_pair("hl", stored(query_images(capture, "hl"), names(capture["ios_map"], 1)))
     turn = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.zeros(3))
-    shown = replace(pair, world_from_rig=pair.world_from_rig @ turn).localizations
+    vars(pair.results)["poses"] = pair.results.poses @ turn
+    shown = pair.localizations
     assert shown.ranked["rotation_error_deg"].item() == pytest.approx(90)
     assert shown.ranked["translation_error_m"].item() == pytest.approx(0, abs=1e-9)
     assert np.linalg.norm((shown.estimated - shown.true)[0, :3, 3]) > 0.01, "the camera stands beside the rig's center"
@@ -104,7 +105,7 @@ def test_errors_are_those_of_the_device_as_in_the_evaluation(capture, open_pair)
 
 def test_a_network_shows_consistent_and_rejected_references_and_claims_no_matches(capture, open_pair):
     images = names(capture["ios_map"], 4)
-    query = LocalizedQuery(query_images(capture, "ios"), images[:2], images[2:])
+    query = stored(query_images(capture, "ios"), images[:2], images[2:])
     details = open_pair("ios", query, method="vggt:simulated/vggt", num_inliers=2).details(0)
     assert [image.name for image in details.references] == images[:2]
     assert [image.name for image in details.rejected] == images[2:]
@@ -117,7 +118,7 @@ def test_a_network_shows_consistent_and_rejected_references_and_claims_no_matche
 
 def test_a_failed_query_shows_its_matches_and_stands_at_its_first_reference(capture, open_pair):
     found = some_correspondences([0] * 4, [False] * 4)
-    query = LocalizedQuery(query_images(capture, "ios"), ["gone.jpg", *names(capture["ios_map"], 2)], [], found)
+    query = stored(query_images(capture, "ios"), ["gone.jpg", *names(capture["ios_map"], 2)], [], found)
     pair = open_pair("ios", query, status="failed: too few inliers")
     center = capture["ios_map"].world_from_cam([0])[0, :3, 3]
     np.testing.assert_allclose(pair.localizations.nearest_reference, [center])
@@ -129,14 +130,14 @@ def test_a_failed_query_shows_its_matches_and_stands_at_its_first_reference(capt
 
 
 def test_a_query_that_the_stage_could_not_begin_has_its_images(capture, open_pair):
-    pair = open_pair("ios", LocalizedQuery(), status="failed: no readable image")
+    pair = open_pair("ios", stored(), status="failed: no readable image")
     (camera,) = pair.details(0).cameras
     assert camera.name == query_images(capture, "ios")[0]
     assert not len(camera.pixels)
 
 
 def test_poses_without_their_correspondences_are_an_error(capture, tmp_path):
-    stem = write_pair(capture, tmp_path, "ios", "ios", [LocalizedQuery()])
+    stem = write_pair(capture, tmp_path, "ios", "ios", [stored()])
     stem.with_name(f"{stem.name}.h5").unlink()
     with pytest.raises(ArtifactError, match=r"\.h5"):
         LocalizedPair.open(capture, "ios", "ios", tmp_path, None)
@@ -144,10 +145,10 @@ def test_poses_without_their_correspondences_are_an_error(capture, tmp_path):
 
 @pytest.mark.parametrize("suffix", ["txt", "csv"])
 def test_files_of_a_run_that_were_cut_off_are_an_error(capture, tmp_path, suffix):
-    stem = write_pair(capture, tmp_path, "ios", "ios", [LocalizedQuery(), LocalizedQuery()])
+    stem = write_pair(capture, tmp_path, "ios", "ios", [stored(), stored()])
     poses, table = (stem.with_name(f"{stem.name}.{end}") for end in ("txt", "csv"))
     write_sidecar(poses, {}, [table])
-    assert len(LocalizedPair.open(capture, "ios", "ios", tmp_path, None).table) == 2
+    assert len(LocalizedPair.open(capture, "ios", "ios", tmp_path, None).results.table) == 2
     torn = stem.with_name(f"{stem.name}.{suffix}")
     torn.write_text("".join(torn.read_text().splitlines(True)[:-1]))
     with pytest.raises(ArtifactError, match=rf"\.{suffix} is damaged"):
@@ -173,7 +174,7 @@ def test_maps_are_those_that_the_poses_were_found_with(tmp_path):
 def test_a_scene_with_a_dot_in_its_name_has_its_maps(small_capture, tmp_path):
     shutil.copytree(small_capture, tmp_path / "HGE.v2")
     capture, asked = Capture.open(tmp_path / "HGE.v2"), []
-    write_pair(capture, tmp_path, "ios", "ios", [LocalizedQuery()], ["ios_map-other.npz"])
+    write_pair(capture, tmp_path, "ios", "ios", [stored()], ["ios_map-other.npz"])
     for name in ("ios_map.npz", "ios_map-other.npz"):
         (tmp_path / name).touch()
     with pytest.MonkeyPatch.context() as patch:
@@ -190,7 +191,7 @@ def test_of_a_large_map_a_regular_choice_of_points_is_shown(monkeypatch):
     poses = np.tile(np.eye(4), (4, 1, 1))
     local_map = LocalMap(list("abcd"), [], poses, points, colors, obs_image, obs_point, obs_point, np.ones(9))
     for most, shown in ((7, [0, 2, 3, 4, 5, 7, 8]), (6, [0, 3, 5, 8]), (3, [0, 4, 8])):
-        monkeypatch.setattr(localized, "MAX_POINTS", most)
+        monkeypatch.setattr(images, "MAX_POINTS", most)
         chosen, their_colors = sure_points(local_map)
         np.testing.assert_array_equal(chosen, points[shown])
         np.testing.assert_array_equal(their_colors, colors[shown])

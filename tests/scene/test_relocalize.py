@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,24 +14,28 @@ from toolkit.capture import Session
 from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles
 from toolkit.manifest import LocalizeSettings
-from toolkit.pose.base import PoseEstimate
+from toolkit.pose.result import QueryResult
 from toolkit.prediction import registry as predictors
 from toolkit.prediction.simulated import SimulatedPredictor
 from toolkit.scene import map as maps
-from toolkit.scene.map import Map
-from toolkit.scene.relocalize import LocalizeAgain
+from toolkit.scene.map import WITHOUT_FEATURES, Map
+from toolkit.scene.stored import StoredQueries
 
 SIMULATED = {"name": "simulated"}
 
 
-def asking(capture: Path, files: SceneFiles, **of_map: Any) -> LocalizeAgain:
+def asking(capture: Path, files: SceneFiles, **of_map: Any) -> tuple[Map, StoredQueries]:
     """Open the phone's map, some of its fields replaced, for the queries of the phone."""
-    place = replace(Map.open(files.run, files.scene, "ios"), **of_map)
-    return LocalizeAgain(place, Session(capture / "sessions/ios_query"), files.retrieval("ios", "ios"))
+    scene_map = replace(Map.open(files.run, files.scene, "ios"), **of_map)
+    return scene_map, StoredQueries(Session(capture / "sessions/ios_query"), files.retrieval("ios", "ios"))
 
 
-def answer(again: LocalizeAgain, **changes: Any) -> PoseEstimate:
-    return again.localize(np.array([0]), again.settings(changes))[0]
+def answer(again: tuple[Map, StoredQueries], **changes: Any) -> QueryResult:
+    scene_map, stored = again[0].changed(changes), again[1]
+    if scene_map.settings.method not in WITHOUT_FEATURES:
+        stored.open_features(scene_map)
+    query, references = stored.query(scene_map, np.array([0]))
+    return scene_map.locate(query, references=references)
 
 
 @pytest.fixture
@@ -67,10 +70,8 @@ def test_features_for_queries_without_a_sure_pose_are_those_of_the_upright_query
 ) -> None:
     escalation = [SimpleNamespace(name="aliked")]
     again = asking(small_capture, finished, settings=LocalizeSettings(), escalation=escalation)
-    localize = Mock(return_value=PoseEstimate("failed: only looked at"))
-    again.map.localizer = SimpleNamespace(localize=localize, image_names=again.map.localizer.image_names)  # type: ignore
-    answer(again)
-    assert [view.turns for view in localize.call_args.args[0].views] == [1]
+    query, _ = again[1].query(again[0], np.array([0]))
+    assert [view.turns for view in query.views] == [1]
 
 
 @pytest.mark.parametrize("method", ["pnp", "hybrid"])
@@ -78,9 +79,10 @@ def test_a_run_of_predictions_can_be_asked_to_match_if_features_of_its_queries_a
     small_capture: Path, finished: SceneFiles, tmp_path: Path, method: str
 ) -> None:
     again = asking(small_capture, finished)
-    assert again.map.settings.method == "feed_forward"
+    assert again[0].settings.method == "feed_forward"
     estimate = answer(again, method=method)
-    assert (estimate.status, estimate.found_by) == ("ok", "pnp")
+    found_by = "pnp" if method == "pnp" else "hybrid:simulated/pnp"
+    assert (estimate.status, estimate.found_by) == ("ok", found_by)
     features = copy_shared(finished.features, tmp_path / "features")
     (of_queries,) = (features / "ios_query").iterdir()
     shutil.rmtree(of_queries)

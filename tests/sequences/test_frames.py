@@ -15,7 +15,8 @@ from toolkit.errors import CameraError, ImageError
 from toolkit.features.matching import LocalMethod, MutualMatcher
 from toolkit.features.sift import SiftExtractor
 from toolkit.manifest import LocalizeSettings, SequenceSettings
-from toolkit.pose.base import PoseEstimate, RoughPose
+from toolkit.pose.base import RoughPose
+from toolkit.pose.result import QueryResult, Status
 from toolkit.scene.map import Map
 from toolkit.sequences import frames
 from toolkit.sequences.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
@@ -42,16 +43,16 @@ def answering(monkeypatch: pytest.MonkeyPatch) -> Callable[[Drive], list[tuple[i
     def answer(way: Drive) -> list[tuple[int, RoughPose | None]]:
         asked = list[tuple[int, RoughPose | None]]()
 
-        def localize(place: object, image: int, *_: object, near: RoughPose | None = None) -> PoseEstimate:
+        def localize(place: object, image: int, *_: object, near: RoughPose | None = None) -> QueryResult:
             asked.append((image, near))
             if image == 6:
                 raise ImageError("torn")
             if image % 3 == 1 and near is None:
-                return PoseEstimate("failed: too few matches")
+                return QueryResult.failed("too few matches")
             frame = way.queries.frames[image]
             pose = way.world_from_rig[frame] if near is not None else way.queries.world_from_rig[image]
             covariance = SURE if near is not None else way.queries.covariances[image]
-            return PoseEstimate("ok", pose, covariance, p_correct=0.99)
+            return QueryResult(Status.OK, "", pose, covariance, p_correct=0.99)
 
         monkeypatch.setattr(frames, "localize_image", localize)
         return asked
@@ -73,7 +74,7 @@ def test_all_frames_have_poses_and_what_failed_is_asked_again(answering: Any) ->
     failed = [frame for frame, estimate in done.single.items() if estimate.status.startswith("failed")]
     assert list(done.again) == failed
     assert {image for image, near in asked if near is not None} == {1, 4, 6, 7, 10, 13, 16, 19}
-    assert done.single[int(way.queries.frames[6])].status == "failed: torn"
+    assert done.single[int(way.queries.frames[6])].status_text == "failed: torn"
 
 
 def test_pieces_are_placed_each_on_its_own(answering: Any) -> None:
@@ -126,7 +127,7 @@ GRAY = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
         (GRAY, "phone", None, "camera: found 'phone'"),
         (GRAY, None, None, "camera: found None"),
         (GRAY[:, 1:], CAMERA, None, "639 x 480 pixels, its camera 640 x 480"),
-        ([GRAY, GRAY], (CAMERA,), np.eye(4)[None], "2 pictures, 1 cameras"),
+        ([GRAY, GRAY], (CAMERA,), np.eye(4)[None], "2 images, 1 cameras"),
         ([GRAY], (CAMERA,), np.diag([2.0, 2, 2, 1])[None], "rig_from_cams: found no pose"),
     ],
 )
@@ -141,7 +142,7 @@ def test_a_camera_that_does_not_fit_its_picture_is_an_error_unlike_an_unreadable
     with pytest.raises(CameraError, match=message):
         SequenceLocalizer(place, None, rig_from_cams).add(0, np.eye(4), picture, cameras)
     done = localize_sequence(place, ["nowhere.jpg"], CAMERA, odometry)
-    assert done.single[0].status == "failed: Image not found: nowhere.jpg"
+    assert done.single[0].status_text == "failed: Image not found: nowhere.jpg"
     localizer = SequenceLocalizer(place)
     assert localizer.add(0, np.eye(4), "nowhere.jpg", CAMERA).status.startswith("failed")
     assert localizer.single is not None
@@ -149,7 +150,7 @@ def test_a_camera_that_does_not_fit_its_picture_is_an_error_unlike_an_unreadable
 
 
 def test_a_frame_can_be_added_again_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = PoseEstimate("ok", np.eye(4), SURE, p_correct=0.99)
+    found = QueryResult(Status.OK, "", np.eye(4), SURE, p_correct=0.99)
     monkeypatch.setattr(frames, "localize_image", Mock(side_effect=[CameraError("another size"), found, found]))
     localizer = SequenceLocalizer(PLACE)
     with pytest.raises(CameraError, match="another size"):
@@ -176,8 +177,8 @@ def test_frame_by_frame_the_latest_pose_rests_on_the_past(answering: Any) -> Non
     assert geometry.pose_error(found, way.world_from_rig)[1].max() < 0.5
     numbers = [number for number in range(16) if number % 3 != 1 and number != 6]
     known = {
-        int(way.queries.frames[number]): PoseEstimate(
-            "ok", way.queries.world_from_rig[number], way.queries.covariances[number], p_correct=0.99
+        int(way.queries.frames[number]): QueryResult(
+            Status.OK, "", way.queries.world_from_rig[number], way.queries.covariances[number], p_correct=0.99
         )
         for number in numbers
     }
@@ -193,7 +194,7 @@ def test_between_pictures_odometry_leads_on_and_the_covariance_grows_as_in_the_g
     later = way.odometry.part(slice(1, 6))
     led = [localizer.add(time, pose) for time, pose in zip(later.timestamps, later.odom_from_rig, strict=True)]
     assert localizer.single is None
-    first = queries_of({0: PoseEstimate("ok", way.queries.world_from_rig[0], way.queries.covariances[0])})
+    first = queries_of({0: QueryResult(Status.OK, "", way.queries.world_from_rig[0], way.queries.covariances[0])})
     graph = place_piece(way.odometry.part(slice(0, 6)), first, SequenceSettings(scale_std=1e-6))
     np.testing.assert_allclose(np.asarray(led[-1].world_from_rig), graph.world_from_rig[-1], atol=1e-6)
     stated = np.sqrt(np.diag(np.asarray(led[-1].covariance)))

@@ -9,7 +9,8 @@ import pytest
 from tests.sequences.drifting import Drive, drive
 from toolkit import geometry
 from toolkit.manifest import SequenceSettings
-from toolkit.pose.base import PoseEstimate, RoughPose
+from toolkit.pose.base import RoughPose
+from toolkit.pose.result import QueryResult, Status
 from toolkit.sequences.odometry import PosedQueries
 from toolkit.sequences.piece import STEPS, localize_piece, with_relocalized
 
@@ -18,8 +19,8 @@ SETTINGS = SequenceSettings()
 SURE = np.diag(np.repeat([1e-3, 0.01], 3) ** 2)
 
 
-def answer(way: Drive, frame: int, status: str = "ok") -> PoseEstimate:
-    return PoseEstimate(status, way.world_from_rig[frame], SURE)
+def answer(way: Drive, frame: int, status: str = "ok") -> QueryResult:
+    return QueryResult(Status(status), "", way.world_from_rig[frame], SURE)
 
 
 def test_what_failed_or_contradicts_is_asked_again_and_then_counts() -> None:
@@ -27,7 +28,7 @@ def test_what_failed_or_contradicts_is_asked_again_and_then_counts() -> None:
     asked = np.append(way.queries.frames, 39)  # the last has no pose
     seen: list[int] = []
 
-    def again(todo: Sequence[tuple[int, RoughPose]]) -> list[PoseEstimate]:
+    def again(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
         seen.extend(frame for frame, _ in todo)
         for frame, about in todo:
             rotation_deg, distance_m = geometry.pose_error(about.world_from_rig, way.world_from_rig[frame])
@@ -70,13 +71,13 @@ def test_a_pose_that_agrees_replaces_the_first_and_another_stands_beside_it() ->
     far = replace(answer(way, frame), world_from_rig=geometry.make_pose(np.eye(3), [500.0, 0.0, 0.0]))
     both = with_relocalized(way.queries, {frame: far})
     assert (both.frames == frame).sum() == 2
-    for nothing in (PoseEstimate("failed: too few matches"), PoseEstimate("low_confidence", np.eye(4))):
+    for nothing in (QueryResult.failed("too few matches"), QueryResult(Status.LOW_CONFIDENCE, "", np.eye(4))):
         assert len(with_relocalized(way.queries, {1: nothing})) == len(way.queries)
 
 
 def test_an_answer_that_contradicts_the_others_changes_nothing() -> None:
     way = drive(np.random.default_rng(3))
-    far = PoseEstimate("ok", geometry.make_pose(np.eye(3), [500.0, 0.0, 0.0]), SURE)
+    far = QueryResult(Status.OK, "", geometry.make_pose(np.eye(3), [500.0, 0.0, 0.0]), SURE)
     asked = np.append(way.queries.frames, 39)
     alone = localize_piece(way.odometry, way.queries, asked, SETTINGS)
     done = localize_piece(way.odometry, way.queries, asked, SETTINGS, lambda todo: [far for _ in todo])
@@ -88,7 +89,7 @@ def test_a_piece_without_a_pose_is_not_searched_for() -> None:
     way = drive(np.random.default_rng(4))
     nothing: PosedQueries = way.queries.choose(np.zeros(0, np.int64))
 
-    def again(todo: Sequence[tuple[int, RoughPose]]) -> list[PoseEstimate]:
+    def again(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
         raise AssertionError
 
     done = localize_piece(way.odometry, nothing, np.array([3, 5]), SETTINGS, again)
@@ -102,7 +103,7 @@ def test_online_a_query_is_found_again_from_the_past_alone() -> None:
     queries = way.queries.choose(way.queries.frames < 20)
     rough: dict[int, RoughPose] = {}
 
-    def again(todo: Sequence[tuple[int, RoughPose]]) -> list[PoseEstimate]:
+    def again(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
         rough.update(todo)
         return [answer(way, frame) for frame, _ in todo]
 

@@ -9,13 +9,12 @@ import pyarrow as pa
 import pycolmap
 import pytest
 
-from tests.localized import write_queries
+from tests.localized import stored, write_queries
 from toolkit import geometry
 from toolkit.capture import Capture, Trajectory, write_depth, write_session
 from toolkit.errors import ArtifactError, CaptureError
 from toolkit.geometry import make_pose, quaternion_to_rotation
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.correspondences import LocalizedQuery
 from toolkit.results.images import Localizations, QueryDetails, ShownImage
 from toolkit.viewer.blueprint import scene_view, shown_intrinsics, small_jpeg, spawn_viewer
 from toolkit.viewer.queries import record_localizations
@@ -213,7 +212,7 @@ def test_queries_stand_where_a_trajectories_file_says(capture, map_dir, tmp_path
     Trajectory.from_poses(truth.timestamps[1:3], truth.device_ids[1:3], estimated).write(file)
     names = [Capture.open(capture)["hl_map"].image_name(row) for row in (0, 4)]
     keys = zip(truth.timestamps[1:3].tolist(), truth.device_ids[1:3].tolist(), strict=True)
-    queries = dict(zip(keys, [LocalizedQuery(references=names), LocalizedQuery()], strict=True))
+    queries = dict(zip(keys, [stored(references=names), stored()], strict=True))
     write_queries(file.with_suffix(".h5"), queries, ["hl_map-superpoint.npz"])
     asked = {"queries_pose": file, "vis_retrieve_queries": True, "map_dir": map_dir, "progress": False}
     done = record_session(capture, "query", "hl", out=tmp_path / "query.rrd", **asked)

@@ -41,7 +41,7 @@ class Status(StrEnum):
 
 def statuses(texts: pd.Series) -> pd.Series:
     """Return the column `status` of a table without the reasons: `ok`, `low_confidence`, `failed`."""
-    return texts.astype(object).fillna("").astype(str).str.partition(": ")[0]
+    return texts.astype(object).fillna("").astype(str).str.split(":", n=1).str[0]
 
 
 def status_counts(texts: pd.Series) -> dict[str, int]:

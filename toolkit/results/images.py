@@ -178,7 +178,7 @@ class LocalizedPair:
         rows = session.rows_of_keyframes(results.table)
         has_image = np.array([len(images) > 0 for images in rows], bool)
         results = replace(results, table=results.table[has_image].reset_index(drop=True))
-        _ = results.poses  # a missing file is reported here
+        _ = results.poses, results.maps  # a missing file is reported here
         images, local_map = [images for images in rows if len(images)], results.local_map(map_dir)
         return cls(results, capture[f"{map_device}_map"], session, images, local_map)
 

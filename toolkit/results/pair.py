@@ -149,12 +149,12 @@ class PairResults:
         row: dict[str, Any] = self.table.iloc[number].to_dict()
         pose, covariance = self.poses[number], self.covariances[number]
         return replace(
-            self._stored(int(row["timestamp"]), str(row["device_id"])).with_row(row),
+            self.stored(int(row["timestamp"]), str(row["device_id"])).with_row(row),
             world_from_rig=pose if is_posed(pose) else None,
             covariance=None if np.isnan(covariance).all() else covariance,
         )
 
-    def _stored(self, timestamp: int, device_id: str) -> QueryResult:
+    def stored(self, timestamp: int, device_id: str) -> QueryResult:
         """Return the arrays of a query; empty if the stage could not process it."""
         name = query_group(timestamp, device_id)
         if not has_group(self._file, name):

@@ -1,0 +1,116 @@
+"""The way of a query through a map: when fallback features are used, and what they judge."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.pose.test_local_triangulation import Scene
+from toolkit.features.features import LocalFeatures
+from toolkit.manifest import LocalizeSettings
+from toolkit.pose.base import Localizer, Prior, Query, QueryMatches, References
+from toolkit.pose.result import CAMERA, QueryResult, Rival, Status
+from toolkit.scene.map import Map
+
+
+class Scripted(Localizer):
+    """A localizer that answers what it was told, and keeps what it was asked."""
+
+    image_names = ["a"]  # noqa: RUF012
+
+    def __init__(self, *answers: QueryResult) -> None:
+        self.answers, self.asked, self.priors = list(answers), list[Query](), list[Prior]()
+
+    def solve(self, matches: QueryMatches, prediction: Any = None, priors: Sequence[Prior] = ()) -> QueryResult:
+        self.asked.append(matches.query)
+        self.priors += priors
+        return self.answers.pop(0)
+
+
+def with_pixels(query: Query) -> Query:
+    """Return a query whose images have the size of their cameras."""
+    blank = np.zeros((480, 640), np.uint8)
+    return replace(query, views=[replace(view, image=blank) for view in query.views])
+
+
+def scripted_map(
+    first: Localizer, fallback: Localizer, kinds: Sequence[Any], near: dict[float, list[int]] | None = None
+) -> Map:
+    """Return a map with these localizers; `near`: indices of the map images that may show a pose, by its x."""
+    scene_map = Map("ios", Path(), Path(), LocalizeSettings(unit="m"), escalation=kinds)
+    vars(scene_map).update(localizer=first, fallback=fallback)
+    vars(scene_map)["_images_near"] = lambda pose: np.array((near or {}).get(pose[0, 3], []), np.int64)
+    return scene_map
+
+
+OK, LOW = QueryResult(Status.OK, "", np.eye(4)), QueryResult(Status.LOW_CONFIDENCE, "", np.eye(4))
+VAGUE = replace(OK, covariance=np.eye(6))
+FAILED = QueryResult.failed("no consistent pose")
+DOUBTED = QueryResult(Status.LOW_CONFIDENCE, CAMERA, np.eye(4), misfit=True)
+SLIGHT = replace(VAGUE, misfit=True)  # a misfit that shows in the covariance alone
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "status", "found_by"),
+    [
+        (OK, None, "ok", "pnp"),
+        (DOUBTED, None, "low_confidence: camera?", "pnp"),
+        (SLIGHT, None, "ok", "pnp"),
+        (FAILED, DOUBTED, "low_confidence: camera?", "pnp+sift"),
+        (LOW, OK, "ok", "pnp+sift"),
+        (FAILED, OK, "ok", "pnp+sift"),
+        (LOW, LOW, "low_confidence", "pnp+sift"),
+        (LOW, FAILED, "low_confidence", "pnp"),
+        (VAGUE, OK, "ok", "pnp+sift"),
+        (VAGUE, LOW, "ok", "pnp"),
+        (FAILED, FAILED, "failed: no consistent pose", "pnp"),
+    ],
+)
+def test_more_features_are_asked_where_a_pose_is_not_sure(
+    first: QueryResult, second: QueryResult | None, status: str, found_by: str
+) -> None:
+    scene = Scene()
+    extracted: list[NDArray[np.uint8]] = []
+
+    def extract(images: Sequence[NDArray[np.uint8]]) -> list[LocalFeatures]:
+        extracted.extend(images)
+        return [scene.features[scene.names[0]]] * len(images)
+
+    extractor = SimpleNamespace(extract=extract, color=False)
+    further = Scripted(*([] if second is None else [second]))
+    kind: Any = SimpleNamespace(name="sift", extractor=extractor)
+    scene_map = scripted_map(Scripted(first), further, [kind])
+    result = scene_map.locate(with_pixels(scene.query), references=scene.references)
+    assert (result.status_text, result.found_by) == (status, found_by)
+    assert result.first_status == (None if second is None else first.status_text)
+    assert len(extracted) == len(further.asked) == (second is not None)
+    if further.asked:
+        assert [len(kinds) for kinds in further.asked[0].features] == [2]
+
+
+def test_what_the_first_attempt_knew_of_rivals_is_judged_by_all_features() -> None:
+    """More features once turned a wrong pose into ok, as they had forgotten the rival that SIFT knew."""
+    scene, there, far = Scene(), np.eye(4), np.eye(4)
+    there[0, 3], far[0, 3] = 28.0, 900.0
+    first = replace(LOW, rivals=(Rival(there, 0.9), Rival(far, 0.3)))
+    extractor = SimpleNamespace(extract=lambda images: [scene.features[scene.names[0]]] * len(images), color=False)
+    further, kind = Scripted(OK), SimpleNamespace(name="sift", extractor=extractor)
+    near = {0.0: [0, 1], 28.0: [5], 900.0: []}
+    scripted_map(Scripted(first), further, [kind], near).locate(with_pixels(scene.query), references=scene.references)
+    assert [(prior.world_from_rig[0, 3], prior.images.tolist()) for prior in further.priors] == [(0, [0, 1]), (28, [5])]
+
+
+@pytest.mark.parametrize("lacks", ["references", "readable image"])
+def test_a_query_that_nothing_can_help_is_not_asked_again(lacks: str) -> None:
+    scene = Scene()
+    query = scene.query if lacks == "references" else replace(scene.query, features=["no image"])
+    references = [References.of([])] if lacks == "references" else scene.references
+    first, further = Scripted(FAILED), Scripted()
+    result = scripted_map(first, further, []).locate(query, references=references)
+    assert (result.status_text, result.first_status) == (FAILED.status_text, None)
+    assert not further.asked
