@@ -22,14 +22,14 @@ demo: $(INSTALLED)  ## render a small capture, localize all nine pairs, write a 
 run: $(INSTALLED)  ## run RUN_MANIFEST=data_manifests/<yours>.yaml
 	$(BIN)/python -m toolkit run $(RUN_MANIFEST)
 
-test: $(INSTALLED)  ## run the default tests, 4 to 8 minutes on 2 idle cores
+test: $(INSTALLED)  ## run the default tests, about 3 minutes on 2 idle cores
 	$(PYTEST)
 
 # An AVX2 laptop has the kernels of Haswell, a processor without AVX those of Prescott.
 test-kernels: $(INSTALLED)  ## run the tests of numbers with other BLAS kernels and numbers of threads
-	@set -e; for kernel in Haswell Prescott; do for threads in 1 2; do echo "$$kernel, $$threads BLAS threads"; \
-	OPENBLAS_CORETYPE=$$kernel OPENBLAS_NUM_THREADS=$$threads $(PYTEST) tests/test_threads.py tests/test_localize.py \
-	tests/test_geometry.py tests/features tests/embedders tests/alignment tests/mapping tests/pose tests/prediction tests/scene tests/sequences; done; done
+	@set -e; for run in "Haswell 1" "Prescott 2"; do echo "$$run BLAS threads"; \
+	OPENBLAS_CORETYPE=$${run% *} OPENBLAS_NUM_THREADS=$${run#* } $(PYTEST) tests/test_threads.py tests/test_localize.py \
+	tests/test_geometry.py tests/features tests/embedders tests/alignment tests/mapping tests/pose tests/prediction tests/scene tests/sequences; done
 
 test-slow: $(INSTALLED)  ## run the slow tests: whole runs, and accuracy on real captures if present
 	$(PYTEST) -m slow

@@ -5,9 +5,13 @@ import json
 import os
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from toolkit.synthetic.devices import Device
 
 
 def limit_cores(threads: int) -> None:
@@ -35,6 +39,19 @@ def part_of_capture(capture: Path, mapped: str, asked: str, folder: Path) -> Pat
         if {"map": mapped, "query": asked}.get(split, "all") in ("all", device):
             (sessions / session.name).symlink_to(session)
     return sessions.parent
+
+
+def scaled(device: "Device", scale: float) -> "Device":
+    """Return a rendered device with pinhole cameras whose images have `scale` times the width and height."""
+    sensors = (
+        replace(
+            sensor,
+            size=(round(scale * sensor.size[0]), round(scale * sensor.size[1])),
+            params=tuple(scale * param for param in sensor.params),
+        )
+        for sensor in device.sensors
+    )
+    return replace(device, sensors=tuple(sensors))
 
 
 def markdown_table(header: list[str], rows: list[list[str]]) -> str:

@@ -19,14 +19,20 @@ of the one-sided 95 % interval (Clopper, Pearson 1934), by scene and by way.
 
 import argparse
 import shutil
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+from unittest.mock import patch
 
 import cv2
 import numpy as np
 import pandas as pd
 from common import add_out, check_out, limit_cores, markdown_table, write_out
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from toolkit.synthetic.scene import Quad, Scene
+    from toolkit.synthetic.textures import Material
 
 WRONG = (5.0, 0.5)  # degrees, meters
 CONFIDENCE = 0.95
@@ -36,6 +42,8 @@ SIGNS = {"log_inliers": 1, "inlier_ratio": 1, "coverage": 1, "rival_support": -1
 """Of the weights: more inliers never make a pose less probable, whatever some hundred rows say."""
 BINS = (0.0, 0.1, 0.5, 0.9, 0.99, 1.0)
 DEGRADATIONS = ("none", "dark", "blurred", "fog", "hidden", "dark, hidden")
+SOLD_OFTEN = ("books", "crate", "door", "drawers", "window")  # materials of which there are few models
+MODELS = 2  # textures per such material and size in whole meters
 
 Image = NDArray[np.uint8]
 
@@ -251,16 +259,37 @@ def markdown(rows: pd.DataFrame, held_out: list[str]) -> str:
     return "\n".join(text) + "\n"
 
 
+def room_of_few_models(seed: int, index: int, look: int | None = None) -> "Scene":
+    """Return a room with doors, windows, shelves, cabinets and crates in few models, as in all rooms of the seed."""
+    from toolkit.synthetic.scene import build_room, named_rng
+    from toolkit.synthetic.textures import Image, Rng
+
+    def draw(quad: "Quad", material: "Material", name: str, rng: Rng, h: int, w: int, ppm: float) -> Image:
+        # Draw the texture for whole meters and crop it, so that objects of different widths share their left part.
+        full_h, full_w = (round(np.ceil(side) * ppm) + 32 for side in (quad.height, quad.width))
+        return material(named_rng(seed, "model", name, int(rng.integers(MODELS))), full_h, full_w, ppm)[:h, :w]
+
+    room = build_room(seed, index, look)
+    for quad in room.quads:
+        name = getattr(quad.material, "func", quad.material).__name__
+        if name in SOLD_OFTEN:
+            quad.material = partial(draw, quad, quad.material, name)
+    return room
+
+
 def make_rows(folder: Path, captures: list[Path], rendered: list[int], alike: list[int]) -> pd.DataFrame:
     """Return the rows of all captures in all ways; make what is not there."""
-    from toolkit.synthetic import render_capture
+    from toolkit.synthetic import capture as rendering
 
     captures = list(captures)
-    for name, seeds, options in (("ROOMS", rendered, {"look_alikes": True}), ("ALIKE", alike, {"alike": True})):
+    for name, seeds in (("ROOMS", rendered), ("ALIKE", alike)):
         for seed in seeds:
             capture = folder / "rendered" / f"{name}{seed}"
-            if not capture.exists():
-                render_capture(capture, 3 if name == "ROOMS" else 2, 6, seed, progress=False, **options)
+            if not capture.exists() and name == "ALIKE":
+                rendering.render_capture(capture, 2, 6, seed, progress=False, alike=True)
+            elif not capture.exists():
+                with patch.object(rendering, "build_room", room_of_few_models):
+                    rendering.render_capture(capture, 3, 6, seed, progress=False)
             captures.append(capture)
     tables = []
     for name, way in WAYS.items():

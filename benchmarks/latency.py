@@ -17,7 +17,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import add_out, check_out, in_own_process, limit_cores, markdown_table, part_of_capture, write_out
+from common import (
+    add_out,
+    check_out,
+    in_own_process,
+    limit_cores,
+    markdown_table,
+    part_of_capture,
+    scaled,
+    write_out,
+)
 from numpy.typing import NDArray
 
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -133,7 +142,7 @@ def main() -> None:
         capture = options.capture
         if capture is None:
             from toolkit.synthetic import render_capture
-            from toolkit.synthetic.devices import DEVICES, scaled
+            from toolkit.synthetic.devices import DEVICES
 
             DEVICES["ios"] = scaled(DEVICES["ios"], options.scale)
             capture = render_capture(Path(folder) / "RENDERED", rooms=2, frames=12, seed=0, progress=False)

@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import add_out, check_out, in_own_process, limit_cores, markdown_table, write_out
+from common import add_out, check_out, in_own_process, limit_cores, markdown_table, scaled, write_out
 
 from toolkit.files import SceneFiles
 
@@ -107,7 +107,7 @@ def render(folder: Path, images: int) -> Path:
     """Render whole rooms of about so many map images, if they are not there, and list the queries."""
     from toolkit.capture import Session
     from toolkit.synthetic import capture as rendering
-    from toolkit.synthetic.devices import DEVICES, scaled
+    from toolkit.synthetic.devices import DEVICES
 
     rendering.DEVICES = {"ios": scaled(DEVICES["ios"], 0.5)}  # this process renders nothing else
     rooms = max(1, round(images / FRAMES))

@@ -176,11 +176,11 @@ def copy_notebook(stage: str, run: Path, sessions_root: Path, folder: Path) -> s
     import nbformat
 
     from toolkit.files import SceneFiles
-    from toolkit.notebook import notebook_parameters, notebook_path, stage_folders, stage_outputs
+    from toolkit.notebook import notebook_parameters, notebook_path
 
     source, files = notebook_path(stage), SceneFiles(run, sessions_root.parent.name)
-    results = shutil.copytree(stage_outputs(files, stage), folder / "results")
-    places = {**stage_folders(files), "sessions_root": sessions_root, "out_dir": results}
+    results = shutil.copytree(files.of_stage(stage), folder / "results")
+    places = {**files.folders(stage), "sessions_root": sessions_root, "out_dir": results}
     parameters = notebook_parameters(source)
     parameters |= {name: str(path) for name, path in places.items() if name in parameters}
     content = nbformat.read(source, as_version=4)

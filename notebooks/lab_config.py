@@ -1,8 +1,26 @@
 """JupyterLab's settings, as `make lab` starts it."""
 
 import warnings
+from typing import Any
 
-from toolkit.runs.lab import drop_widgets
+WIDGET = "application/vnd.jupyter.widget-view+json"
+
+
+def drop_widgets(model: dict[str, Any], **_: Any) -> None:
+    """Remove widgets (progress bars, viewers) from a notebook that is about to be saved.
+
+    A saved widget is only a reference to a live page: reopened, it shows `Error displaying widget`.
+
+    Args:
+        model: Jupyter's contents model; its `content`, the notebook, is changed in place.
+    """
+    if model.get("type") != "notebook" or not isinstance(model.get("content"), dict):
+        return
+    for cell in model["content"].get("cells", []):
+        if "outputs" in cell:
+            cell["outputs"] = [output for output in cell["outputs"] if WIDGET not in output.get("data", {})]
+    model["content"].get("metadata", {}).pop("widgets", None)
+
 
 # Jupyter reads this file twice, and would tell that the second time replaces the first.
 warnings.filterwarnings("ignore", "Overriding existing pre_save_hook")

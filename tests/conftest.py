@@ -73,6 +73,21 @@ def small_features(small_capture: Path, made_once: Callable[[str, Callable[[Path
 
 
 @pytest.fixture(scope="session")
+def small_embedded(
+    small_capture: Path, small_features: Path, made_once: Callable[[str, Callable[[Path], object]], Path]
+) -> Path:
+    """A folder with `features` and `embeddings` (default settings) of all sessions of `small_capture`; copy it."""
+    from tests.rendered import copy_shared
+    from toolkit.embed import embed_sessions
+
+    def make(folder: Path) -> None:
+        features = copy_shared(small_features, folder / "SMALL" / "features")
+        embed_sessions(small_capture / "sessions", folder / "SMALL" / "embeddings", features_dir=features)
+
+    return made_once("embedded", make) / "SMALL"
+
+
+@pytest.fixture(scope="session")
 def tiny_embedded(made_once: Callable[[str, Callable[[Path], object]], Path]) -> Path:
     """A folder with a capture `TINY` of photographs of walls and its `embeddings`; do not write to it."""
     from tests.test_embed import write_tiny_capture

@@ -3,7 +3,7 @@
 import logging
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -153,22 +153,18 @@ ARTIFACTS: dict[str, tuple[Callable[[Path, SceneFiles], pd.DataFrame], str, tupl
 """The stage that makes an artifact, its files, and what has to be gone so that the stage looks at it again."""
 
 
-QUICK = ("vectors", "poses")  # with all kinds of damage
+THOROUGH = ("vectors", "poses")  # with all kinds of damage
 LONG = ("features of the map",)  # the whole map is made again
 
 
-def is_quick(artifact: str, how: str) -> bool:
-    return artifact in QUICK or (how == "one byte differs" and artifact not in LONG)
+def cases() -> Iterator[Any]:
+    for artifact in ARTIFACTS:
+        for how in DAMAGES if artifact in THOROUGH else ("one byte differs", "half", "gone"):
+            quick = artifact in THOROUGH or (how == "one byte differs" and artifact not in LONG)
+            yield pytest.param(artifact, how, marks=() if quick else pytest.mark.slow)
 
 
-@pytest.mark.parametrize(
-    ("artifact", "how"),
-    [
-        pytest.param(name, how, marks=() if is_quick(name, how) else pytest.mark.slow)
-        for name in ARTIFACTS
-        for how in DAMAGES
-    ],
-)
+@pytest.mark.parametrize(("artifact", "how"), cases())
 def test_a_damaged_artifact_is_made_again_as_it_was(
     capture: Path,
     finished: SceneFiles,

@@ -70,13 +70,12 @@ def run_stage(capture: Path, files: SceneFiles, **more: object) -> pd.DataFrame:
 
 @pytest.fixture(scope="module")
 def finished(
-    small_capture: Path, small_features: Path, tmp_path_factory: pytest.TempPathFactory
+    small_capture: Path, small_embedded: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[SceneFiles, pd.DataFrame]:
     """A run that has localized all devices in the phone's map, and its table; do not write to it."""
     files = SceneFiles(tmp_path_factory.mktemp("run"), small_capture.name)
-    copy_shared(small_features, files.features)
+    copy_shared(small_embedded, files.root)
     sessions = small_capture / "sessions"
-    embed_sessions(sessions, files.embeddings, features_dir=files.features)
     retrieve_pairs(sessions, files.embeddings, map_device="ios", out_jsonl=files.retrieval_dir, queries=LIST)
     return files, run_stage(small_capture, files)
 
@@ -449,7 +448,7 @@ def test_a_killed_run_goes_on_where_it_was(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("killed_at", "calls_left"), [(2, 4), pytest.param(4, 2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("killed_at", "calls_left"), [(2, 4), (4, 2)])
 def test_a_killed_run_goes_on_where_it_asks_for_more_features(
     small_capture: Path,
     run: SceneFiles,
@@ -1008,20 +1007,20 @@ ESCALATES = {"features": {"kinds": ["sift"], "escalation": ["other"]}, "pnp": {"
 """No pose is sure, so each query is asked again with another kind of features."""
 
 
-@pytest.mark.parametrize("device", ["ios", "spot"])
 @pytest.mark.parametrize(
-    "method",
+    ("method", "device"),
     [
-        {"method": "pnp"},
-        {"method": "nearest"},
-        pytest.param({"method": "feed_forward"}, marks=pytest.mark.slow),
-        pytest.param({"method": "hybrid"}, marks=pytest.mark.slow),
-        pytest.param({"map": None}, marks=pytest.mark.slow),
-        pytest.param(ESCALATES, marks=pytest.mark.slow),
-        pytest.param({**ESCALATES, "method": "hybrid"}, marks=pytest.mark.slow),
-        pytest.param({**ESCALATES, "map": None}, marks=pytest.mark.slow),
+        ({"method": "pnp"}, "ios"),
+        ({"method": "pnp"}, "spot"),
+        ({"method": "nearest"}, "ios"),
+        ({"method": "nearest"}, "spot"),
+        pytest.param({"method": "feed_forward"}, "spot", marks=pytest.mark.slow),
+        pytest.param({"method": "hybrid"}, "ios", marks=pytest.mark.slow),
+        pytest.param({"map": None}, "spot", marks=pytest.mark.slow),
+        pytest.param(ESCALATES, "ios", marks=pytest.mark.slow),
+        pytest.param({**ESCALATES, "method": "hybrid"}, "spot", marks=pytest.mark.slow),
+        pytest.param({**ESCALATES, "map": None}, "ios", marks=pytest.mark.slow),
     ],
-    ids=["pnp", "nearest", "feed_forward", "hybrid", "no map", "escalates", "hybrid escalates", "no map escalates"],
 )
 def test_pictures_and_inspections_get_the_pose_of_the_run_byte_for_byte(
     small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch, method: dict[str, Any], device: str

@@ -12,7 +12,9 @@ from toolkit.manifest import (
     Manifest,
     MapSettings,
     MatcherSettings,
+    PnpSettings,
     PredictorSettings,
+    RetrieveSettings,
     Settings,
     describe,
     load_manifest,
@@ -132,13 +134,19 @@ def test_a_wrong_base_is_named_with_its_heir(tmp_path: Path) -> None:
     text = message(mine="inherits: base.yaml", base="captures: a: b")
     assert f"{base}: not valid YAML" in text
     text = message(mine="inherits: none.yaml")
-    assert text == f"{mine}: inherits {tmp_path / 'none.yaml'}, and there is no such file. Correct `inherits`."
+    assert text.startswith(f"{mine}: inherits {tmp_path / 'none.yaml'}: no such manifest")
     text = message(mine="inherits: base.yaml", base="inherits: mine.yaml")
     assert text.startswith(f"{mine} inherits {base} inherits {mine}: a manifest cannot inherit from itself")
     text = message(mine="inherits: mine.yaml")
     assert text.startswith(f"{mine} inherits {mine}: a manifest cannot inherit from itself")
     text = message(mine="inherits: {a: b}")
     assert "inherits: found {'a': 'b'}, expected a file name or a list of them" in text
+
+
+def test_null_turns_a_part_off_and_leaves_a_section_as_it_is(tmp_path: Path) -> None:
+    manifest = load_manifest(write(tmp_path, "captures: [a]\nretrieve:\nlocalize: {map: null, pnp: null}\n"))
+    assert manifest.localize.map is None
+    assert (manifest.retrieve, manifest.localize.pnp) == (RetrieveSettings(), PnpSettings())
 
 
 def test_overrides_are_yaml_and_win(tmp_path: Path) -> None:
@@ -165,7 +173,7 @@ def test_overrides_are_yaml_and_win(tmp_path: Path) -> None:
         ("captures: [a]\nname: ../up", "name: found '../up'"),
         ("name: x", "give either `captures`"),
         ("captures: [a]\ndemo_data: {}", "give either `captures`"),
-        ("captures: [x/a, y/a]", "two folders are called 'a'"),
+        ("captures: [x/a, y/a]", "two folders called 'a'"),
         ("captures: [$NO_SUCH_VARIABLE/a]", "$NO_SUCH_VARIABLE, which is not set"),
         ("captures: a: b", "not valid YAML"),
         ("captures: [a]\nworld_up: [0, 0, 0]", "expected three finite numbers"),

@@ -82,7 +82,7 @@ def test_parameters_are_of_the_run_or_settings_with_their_defaults(stage: str) -
 def test_a_stage_gets_the_parameters_of_its_notebook_and_then_its_dict(monkeypatch: pytest.MonkeyPatch) -> None:
     names = {"topk": 3, "index": "a variable of the user", "settings": {"mask": {"gps": True}}}
     monkeypatch.setattr(notebook, "_user_names", lambda: names)
-    folders = notebook.Folders({}, "retrieve")
+    folders = notebook.Folders("retrieve")
     assert folders.settings == RetrieveSettings.of({"topk": 3, "mask": {"gps": True}})
     names["settings"] = {"topk": 4}  # the cell has run again, with another value
     assert folders.settings.topk == 4
@@ -122,7 +122,8 @@ def test_a_capture_without_truth_has_a_report_too(small_capture: Path, small_run
     capture = shutil.copytree(small_capture, tmp_path / small_capture.name)
     for truth in capture.glob("sessions/*_query/proc/alignment_trajectories.txt"):
         truth.unlink()
-    (tmp_path / "untrue.yaml").write_text(f"captures: ['{capture}']\noutput_root: runs\nvisualize: {{samples: 1}}\n")
+    quick = "{samples: 1, recordings: false, session_recordings: false}"
+    (tmp_path / "untrue.yaml").write_text(f"captures: ['{capture}']\noutput_root: runs\nvisualize: {quick}\n")
     run = tmp_path / "runs" / "untrue"
     shutil.copytree(small_run / "SMALL", run / "SMALL", ignore=shutil.ignore_patterns(".stages", "evaluation"))
     pipeline.run(tmp_path / "untrue.yaml", say=lambda *a, **k: None)
@@ -133,9 +134,9 @@ def test_a_capture_without_truth_has_a_report_too(small_capture: Path, small_run
 
 
 @pytest.mark.slow
-def test_a_run_with_all_stages_is_reused_and_repeated(small_capture: Path, small_run: Path, tmp_path: Path) -> None:
+def test_a_run_with_all_stages_is_reused(small_capture: Path, small_run: Path, tmp_path: Path) -> None:
     manifest = tmp_path / "small.yaml"
-    sections = "rerank: {}\nsequence: {}\nvisualize: {samples: 1}\n"
+    sections = "rerank: {}\nsequence: {}\nvisualize: {samples: 1, session_recordings: false}\n"
     manifest.write_text(f"captures: ['{small_capture}']\noutput_root: runs\n{sections}")
     run = tmp_path / "runs" / "small"
     # What the stages have made is taken over, but for what reranking changes.
@@ -145,7 +146,7 @@ def test_a_run_with_all_stages_is_reused_and_repeated(small_capture: Path, small
     assert first.returncode == 0, first.stdout + first.stderr
     rows = {row["stage"]: row for row in json.loads((run / "run.json").read_text())["stages"]}
     assert list(rows) == list(STAGES)
-    assert rows["retrieve"]["parameters"]["topk"] == rows["rerank"]["parameters"].get("topn", 30)
+    assert rows["retrieve"]["parameters"]["settings"]["topk"] == 30
     assert rows["localize"]["parameters"]["retrieval_dir"].endswith("reranked")
     assert rows["rerank"]["counts"]["pairs"] == 9
     table = (run / "SMALL" / "evaluation" / "overlap.csv").read_text()
@@ -156,19 +157,10 @@ def test_a_run_with_all_stages_is_reused_and_repeated(small_capture: Path, small
     assert set(steps) == {9}
     assert {"single", "graph", "online 10 s", "sequence"} <= set(steps.index)
     assert len(list((run / "SMALL" / "visualization").glob("*_sequence.png"))) == 9
-    poses = sorted((run / "SMALL" / "poses").glob("*.txt"))
-    before = {path.name: path.read_bytes() for path in poses}
-    assert len(before) == 18
+    assert len(list((run / "SMALL" / "poses").glob("*.txt"))) == 18
 
     again = subprocess.run(command, capture_output=True, text=True)
     assert again.stdout.count("reused") == len(STAGES), again.stdout + again.stderr
-
-    pipeline.run(manifest, only="localize", force=True)
-    record = json.loads((run / "run.json").read_text())
-    assert {row["stage"]: row["status"] for row in record["stages"]} == {
-        stage: "done" if stage == "localize" else "reused" for stage in STAGES
-    }
-    assert {path.name: path.read_bytes() for path in poses} == before, "the same seed gives the same poses"
 
 
 def test_a_table_on_a_page_has_medians_first_and_says_nothing_twice() -> None:

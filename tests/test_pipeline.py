@@ -39,12 +39,13 @@ from pathlib import Path
 from toolkit import notebook
 out = Path(out_dir)
 out.mkdir(parents=True, exist_ok=True)
-(out / "log.txt").open("a").write(f"{model} {skip_existing}\\n")
+(out / "log.txt").open("a").write(f"{settings.get('model', model)} {skip_existing}\\n")
 notebook.finish(images=4)
 """
 RETRIEVE = """
 from pathlib import Path
 from toolkit.errors import CaptureError
+topk = settings.get("topk", topk)
 if topk > 50:
     raise CaptureError("images.txt, line 3: found a dragon.")
 out = Path(out_jsonl)
@@ -67,9 +68,9 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     notebooks.mkdir()
     for stage in STAGES:
         write_notebook(notebooks, stage, "samples = 1\nthresholds = []", "")
-    parameters = 'sessions_root = None\nout_dir = None\nmodel = "vlad"\nskip_existing = True'
+    parameters = 'sessions_root = None\nout_dir = None\nmodel = "vlad"\nskip_existing = True\nsettings = {}'
     write_notebook(notebooks, "embed", parameters, EMBED)
-    parameters = 'out_jsonl = None\ntopk = 10\nmap_device = "all"\nquery_device = "all"'
+    parameters = 'out_jsonl = None\ntopk = 10\nmap_device = "all"\nquery_device = "all"\npairs = None\nsettings = {}'
     write_notebook(notebooks, "retrieve", parameters, RETRIEVE)
     monkeypatch.setattr(notebook, "NOTEBOOKS", notebooks)
     monkeypatch.setattr(pipeline, "STAGES", ("embed", "retrieve"))
@@ -174,16 +175,16 @@ def test_no_kernel_is_started_for_what_is_reused(
 def test_a_sweep_takes_over_what_does_not_depend_on_its_keys(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pipeline, "execute", execute_here)
     said: list[str] = []
-    sweeps = ["embed.model=vlad,auto", "retrieve.topk=3,90,5"]
+    sweeps = ["embed.seed=0,1", "retrieve.topk=3,90,5"]
     folders, failed = pipeline.sweep(place / "run.yaml", sweeps, say=lambda *a, **k: said.append(a[0]))
     assert len(folders) == 4
     assert ["found a dragon" in str(error) for error in failed] == [True, True]
     runs = {path.name: path for path in (place / "runs").iterdir()}
-    assert set(runs) == {f"run-model-{model}-topk-{k}" for model in ("vlad", "auto") for k in (3, 90, 5)}
+    assert set(runs) == {f"run-seed-{seed}-topk-{k}" for seed in (0, 1) for k in (3, 90, 5)}
     for name, run in runs.items():
         record = json.loads((run / "run.json").read_text())
         assert record["status"] == ("failed" if name.endswith("90") else "done"), "one does not stop the others"
-    assert (runs["run-model-vlad-topk-5"] / "P/embeddings/log.txt").stat().st_nlink == 3, "of the runs of that model"
+    assert (runs["run-seed-1-topk-5"] / "P/embeddings/log.txt").stat().st_nlink == 3, "of the runs with that seed"
     assert sum("found a dragon" in line for line in said) == 2
 
 
@@ -223,16 +224,13 @@ def test_damage_in_what_a_stage_left_makes_it_run_again(place: Path, go: Callabl
 @pytest.mark.parametrize(("stage", "name"), [("localize", "map/{}_map.npz"), ("retrieve", "index/{}_map.faiss")])
 def test_a_damaged_map_or_index_makes_its_stage_run_again(place: Path, stage: str, name: str) -> None:
     files = SceneFiles(place / "runs", "P")
-    job = pipeline.Job(stage, files, LocalizeSettings(), {"map_device": "ios"}, "map_ios_query_hl")
-    ours, others = (files.root / name.format(device) for device in ("ios", "hl"))
-    for path in (ours, others):
-        write_text(path, "points")
+    job = pipeline.Job(stage, files, LocalizeSettings(), {})
+    path = files.root / name.format("ios")
+    write_text(path, "points")
     before = job.outputs()
-    others.write_text("paints")
-    assert job.outputs() == before, "of another job"
-    ours.write_text("paints")
+    path.write_text("paints")
     assert job.outputs() != before
-    ours.unlink()
+    path.unlink()
     assert job.outputs() != before
 
 
@@ -261,24 +259,6 @@ def test_a_lost_picture_of_a_recording_makes_visualize_run_again(place: Path) ->
     assert job.outputs() != before
 
 
-@pytest.mark.parametrize(
-    ("stage", "label", "mine", "not_mine"),
-    [
-        ("localize", "map_hl_query_hl", ["{}.left_out.json"], ["P_map_hl_query_hl2.txt", "{}_sequence.txt"]),
-        ("sequence", "map_hl_query_hl", ["{}_sequence_steps.csv"], ["{}.txt", "P_map_hl_query_hl2_sequence.csv"]),
-        ("retrieve", "map_hl_query_hl", ["./{}.jsonl.meta.json"], ["P_map_my-hl_query_hl.jsonl"]),
-        ("embed", "hl_", ["hl_map/hl_1/a.npy", "vlad/hl_query/a/a.npy"], ["my-hl_map/a.npy", "my-hl_map/hl_1/a.npy"]),
-    ],
-)
-def test_a_device_with_the_name_of_another_in_its_own_is_told_apart(
-    stage: str, label: str, mine: list[str], not_mine: list[str]
-) -> None:
-    job = pipeline.Job(stage, SceneFiles(Path("runs"), "P"), LocalizeSettings(), {}, label)
-    for names, expected in ((mine, True), (not_mine, False)):
-        for name in names:
-            assert job.makes(name.format("P_map_hl_query_hl")) == expected, name
-
-
 def test_a_stage_with_something_to_try_again_is_not_reused(place: Path, go: Callable[..., dict[str, str]]) -> None:
     jsonl = place / "runs/run/P/retrieval/P_map_all_query_all.jsonl"
     write_text(jsonl, "10")
@@ -290,41 +270,29 @@ def test_a_stage_with_something_to_try_again_is_not_reused(place: Path, go: Call
     assert go() == {"embed": "reused", "retrieve": "reused"}
 
 
-def test_some_pairs_take_an_execution_each(place: Path, go: Callable[..., dict[str, str]]) -> None:
-    assert go("pairs=[[ios, hl], [hl, ios]]", only="retrieve") == {"retrieve": "done"}
-    found = sorted(path.stem for path in (place / "runs/run/P/retrieval").iterdir())
-    assert found == ["P_map_hl_query_ios", "P_map_ios_query_hl"]
-    go("pairs=[[ios, hl], [hl, ios]]", only="retrieve")
-    record = json.loads((place / "runs/run/run.json").read_text())
-    assert [row["status"] for row in record["stages"]] == ["reused", "reused"]
-
-
-def test_devices_select_pairs_of_sessions_that_exist(place: Path) -> None:
+def test_devices_and_pairs_select_what_stages_do(place: Path) -> None:
     spot = place / "P" / "sessions" / "spot_query"
     spot.mkdir()
     (spot / "images.txt").touch()
 
-    def labels(stage: str, *overrides: str) -> list[str]:
-        manifest = load_manifest(place / "run.yaml", overrides)
-        files = SceneFiles(place / "runs" / "run", "P")
-        return [job.label for job in pipeline._jobs(manifest, stage, place / "P", files, force=False)]
+    def selected(*overrides: str) -> dict[str, Any]:
+        return pipeline._selection(load_manifest(place / "run.yaml", overrides), place / "P")
 
-    assert labels("retrieve", "devices=[ios, spot]") == ["map_ios_query_ios", "map_ios_query_spot"]
-    assert labels("embed", "devices=[ios, spot]") == ["ios_", "spot_"]
-    assert labels("retrieve", "devices=[spot, hl, ios]") == labels("retrieve") == [""]
+    assert selected() == {}
+    assert selected("devices=[spot, ios]") == {"pairs": [["ios", "ios"], ["ios", "spot"]], "device": ["ios", "spot"]}
     # A pair that is asked for by name gets a row that says what is missing.
-    named = "pairs=[[ios, ios], [spot, ios], [spot, spot], [ios, spot], [hl, hl], [hl, ios]]"
-    assert len(labels("retrieve", named)) == 6
+    assert selected("pairs=[[spot, ios], [hl, hl]]")["pairs"] == [["spot", "ios"], ["hl", "hl"]]
+    assert selected("pairs=[[ios, hl], [hl, hl]]", "devices=[hl]")["pairs"] == [["hl", "hl"]]
     with pytest.raises(ManifestError, match=r"Its sessions: .*spot_query"):
-        labels("retrieve", "devices=[spot]")
+        selected("devices=[spot]")
     shutil.rmtree(place / "P" / "sessions" / "ios_map")
     shutil.rmtree(place / "P" / "sessions" / "hl_map")
-    assert labels("embed", "devices=[ios]") == ["ios_"]
+    assert selected("devices=[ios]") == {"pairs": [["ios", "ios"]], "device": ["ios"]}
 
 
 def test_reranking_is_switched_on_by_its_section(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pipeline, "STAGES", STAGES)
-    parameters = "retrieval_dir = None\nreranked_dir = None\ntopn = 30\ntopk = 10"
+    parameters = "retrieval_dir = None\nreranked_dir = None\nsettings = {}"
     for stage in ("rerank", "localize", "evaluate"):
         write_notebook(place / "notebooks", stage, parameters, "")
 
@@ -332,9 +300,9 @@ def test_reranking_is_switched_on_by_its_section(place: Path, monkeypatch: pytes
         manifest = load_manifest(place / "run.yaml", overrides)
         files = SceneFiles(place / "runs" / "run", "P")
         return {
-            stage: job.parameters
+            stage: (parameters := pipeline._job(manifest, stage, place / "P", files, force=False).parameters)
+            | parameters.pop("settings", {})
             for stage in manifest.stages
-            for job in pipeline._jobs(manifest, stage, place / "P", files, force=False)
         }
 
     off = asked()
@@ -383,11 +351,7 @@ def test_a_failing_cell_stops_with_its_message_and_the_notebook(
     assert not list(executed.parent.glob(".*"))
 
 
-def test_unknown_parameters_are_refused_before_anything_runs(place: Path) -> None:
-    # This notebook has neither `dtype` nor the dict `settings` for what has no parameter.
-    with pytest.raises(ManifestError, match=r"embed\.settings: 02_embed\.ipynb .*model"):
-        pipeline.run(place / "run.yaml", overrides=["embed.dtype=float16"])
-    assert not (place / "runs").exists()
+def test_unknown_parameters_are_refused(place: Path) -> None:
     with pytest.raises(ManifestError, match=r"top_k.*topk"):
         pipeline.execute(place / "notebooks/03_retrieve.ipynb", place / "out.ipynb", {"top_k": 5})
 
@@ -442,7 +406,7 @@ def test_the_command_line_prints_errors_without_traceback(tmp_path: Path) -> Non
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 def test_a_killed_run_is_taken_up_again(place: Path, go: Callable[..., dict[str, str]]) -> None:
     slow = f"{RETRIEVE}\nimport time\ntime.sleep(0 if Path(out_jsonl, 'again').exists() else 600)"
-    parameters = 'out_jsonl = None\ntopk = 10\nmap_device = "all"\nquery_device = "all"'
+    parameters = 'out_jsonl = None\ntopk = 10\nmap_device = "all"\nquery_device = "all"\nsettings = {}'
     write_notebook(place / "notebooks", "retrieve", parameters, slow)
     script = (
         "from pathlib import Path; from toolkit import notebook, pipeline;"
@@ -473,26 +437,6 @@ def test_a_stage_that_was_stopped_is_not_taken_for_the_one_before(
         with pytest.raises(KeyboardInterrupt):
             go(force=True, only="retrieve")
     assert go() == {"embed": "reused", "retrieve": "done"}, "its notebook is not of a whole execution any more"
-
-
-def test_only_results_of_this_manifest_are_listed_as_reused(
-    place: Path, go: Callable[..., dict[str, str]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def stop(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    def listed() -> list[tuple[str, str, str]]:
-        rows = json.loads((place / "runs/run/run.json").read_text())["stages"]
-        return [(row["stage"], row["part"], row["status"]) for row in rows]
-
-    go("pairs=[[ios, ios]]")
-    go()
-    go(only="embed")
-    assert listed() == [("embed", "", "reused"), ("retrieve", "", "reused")], "not also those of the pair"
-    monkeypatch.setattr(pipeline, "execute", stop)
-    with pytest.raises(KeyboardInterrupt):
-        go("embed.model=auto", force=True)
-    assert listed() == [("embed", "", "interrupted")], "retrieve has the results of former settings"
 
 
 def test_output_that_cannot_be_written_is_said(place: Path) -> None:
@@ -527,7 +471,7 @@ def test_missing_weights_are_told_before_a_capture_is_rendered(
 
 
 def test_other_weights_in_the_same_place_are_noticed(place: Path, go: Callable[..., dict[str, str]]) -> None:
-    parameters = 'sessions_root = None\nout_dir = None\nmodel = "vlad"\ncheckpoint = None\nskip_existing = True'
+    parameters = 'sessions_root = None\nout_dir = None\nmodel = "vlad"\nskip_existing = True\nsettings = {}'
     write_notebook(place / "notebooks", "embed", parameters, EMBED)
     weights = place / "weights" / "model.safetensors"
     weights.parent.mkdir()

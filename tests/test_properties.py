@@ -43,7 +43,7 @@ from toolkit.store.hdf5 import write_groups
 from toolkit.store.items import Items
 
 settings.register_profile("quick", derandomize=True, database=None, deadline=None, max_examples=25)
-settings.register_profile("thorough", derandomize=True, database=None, deadline=None, max_examples=200)
+settings.register_profile("thorough", derandomize=True, database=None, deadline=None, max_examples=100)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
 # A test that gets one folder for all of its examples overwrites what is in it.
 same_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])

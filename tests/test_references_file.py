@@ -22,7 +22,7 @@ def test_rows_come_as_they_are_and_blank_lines_do_not_count(tmp_path: Path) -> N
     [
         ("{", "Expecting property name"),
         ("[]", r"found \[\]; expected the keys"),
-        (json.dumps({"timestamp": "1"}), r"found \['timestamp'\]; expected the keys"),
+        (json.dumps({"timestamp": "1"}), "found .*timestamp.*; expected the keys"),
         (json.dumps(ROW | {"timestamp": "noon"}), "noon"),
         ('{"timestamp": Infinity, "sensor_id": "a", "topk": []}', "infinity"),
         (json.dumps(ROW | {"topk": {}}), "expected a list of references"),

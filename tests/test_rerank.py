@@ -16,7 +16,6 @@ from tests.other_kind import add_other_kind
 from tests.rendered import copy_shared
 from toolkit import rerank
 from toolkit.capture import Capture, Trajectory
-from toolkit.embed import embed_sessions
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.evaluate import overlap_table
 from toolkit.features import verification
@@ -137,12 +136,11 @@ def test_overlap_is_the_share_of_points_in_view() -> None:
 
 
 @pytest.fixture(scope="module")
-def finished(small_capture: Path, small_features: Path, tmp_path_factory: pytest.TempPathFactory) -> SceneFiles:
+def finished(small_capture: Path, small_embedded: Path, tmp_path_factory: pytest.TempPathFactory) -> SceneFiles:
     """A retrieval in the phone's map in reversed order, reranked; do not write to it."""
     files = SceneFiles(tmp_path_factory.mktemp("run"), small_capture.name)
-    copy_shared(small_features, files.features)
+    copy_shared(small_embedded, files.root)
     sessions = small_capture / "sessions"
-    embed_sessions(sessions, files.embeddings, features_dir=files.features)
     retrieve_pairs(
         sessions, files.embeddings, files.retrieval_dir, {"topk": 6}, map_device="ios", query_device="hl", queries=LIST
     )
@@ -407,7 +405,8 @@ def test_map_images_in_memory_are_bounded(monkeypatch: pytest.MonkeyPatch) -> No
             read.append(name)
             return features
 
-    verifier = verification.Verifier(RerankSettings(max_features=4), MutualMatcher(0.8), Store())
+    store = Store(dict.fromkeys("abc", features))
+    verifier = verification.Verifier(RerankSettings(max_features=4), MutualMatcher(0.8), store)
     for name in "ababcab":
         verifier.verify(features, WIDE, [name], [WIDE])
     assert read == ["a", "b", "c", "a", "b"]

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from benchmarks.common import scaled
 from tests.sequences.drifting import PLACE, Drive, drive, lost_in_a_gap, small_motion
 from toolkit import geometry, sequence
 from toolkit.capture import Session, Trajectory
@@ -25,7 +26,7 @@ from toolkit.sequence import COLUMNS, sequence_pairs
 from toolkit.sequences.pose_graph import FAR
 from toolkit.synthetic import capture as rendering
 from toolkit.synthetic import render_capture
-from toolkit.synthetic.devices import DEVICES, scaled
+from toolkit.synthetic.devices import DEVICES
 from toolkit.synthetic.recording import PICTURE_S, RATE_HZ, tracked
 from toolkit.synthetic.scene import Scene, build_room
 

@@ -29,14 +29,12 @@ from toolkit.errors import (
     sentence,
     shortage,
 )
-from toolkit.exchange.interchange import POSE_DIRECTIONS
 from toolkit.manifest import STAGES
-from toolkit.runs.folder import LOG, held
-from toolkit.runs.record import RunLog
+from toolkit.runs.folder import LOG, RunLog, held
 
 __all__ = ["place"]
 
-PARAMETERS = 'out_jsonl = None\ntopk = 10\nmap_device = "all"\nquery_device = "all"'
+PARAMETERS = 'out_jsonl = None\ntopk = 10\nmap_device = "all"\nquery_device = "all"\nsettings = {}'
 
 
 def quiet(*args: object, **options: object) -> None:
@@ -225,8 +223,9 @@ def test_an_error_in_a_cell_has_its_exit_code(place: Path, raised: str, code: in
     assert "Traceback (most recent call last)" in (place / "runs/run" / LOG).read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs signals")
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_the_run_its_kernels_and_sockets(place: Path, number: signal.Signals) -> None:
     code = "from pathlib import Path\nimport time, os\nPath(out_jsonl).parent.mkdir(parents=True, exist_ok=True)\n"
     code += "Path(out_jsonl).write_text(str(os.getpid()))\ntime.sleep(600)"
@@ -310,6 +309,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "--lazy", folder], check=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("used", [0, 60, 64])
 def test_a_disk_of_64_kb_is_told_in_a_sentence(
     here: Path, small_disk: Path, used: int, command: Callable[..., int], capsys: pytest.CaptureFixture[str]
@@ -392,17 +392,17 @@ def test_one_capture_that_fails_does_not_stop_the_others(here: Path, command: Ca
     assert "a dragon" in record["error"]
 
 
-def test_one_pair_that_fails_does_not_stop_the_others(here: Path) -> None:
-    code = "from toolkit.errors import CaptureError\nif query_device == 'hl':\n    raise CaptureError('a dragon')"
+def test_pairs_that_fail_are_counted_against_what_is_tolerated(here: Path) -> None:
+    code = "import pandas as pd\nfrom toolkit import notebook\nreasons = ['a dragon', '']\n"
+    code += "notebook.finish(pd.DataFrame({'map_device': 'ios', 'query_device': ['hl', 'ios'], 'reason': reasons}))"
     write_notebook(here / "notebooks", "retrieve", PARAMETERS, code)
-    pipeline.run(here / "run.yaml", overrides=["pairs=[[ios, hl], [ios, ios]]"], say=quiet, in_place=True)
+    pipeline.run(here / "run.yaml", say=quiet)
     record = record_of(here)
     assert (record["status"], record["exit_code"]) == ("incomplete", 2)
-    assert [row["status"] for row in record["stages"] if row["stage"] == "retrieve"] == ["failed", "done"]
     assert record["failed"]["pairs"] == {"failed": 1, "of": 2}
+    assert "a dragon" in record["error"]
     assert "`devices:`" in record["error"]
-    overrides = ["pairs=[[ios, hl], [ios, ios]]", "tolerate_failed.pairs=0.5"]
-    pipeline.run(here / "run.yaml", overrides=overrides, say=quiet, in_place=True)
+    pipeline.run(here / "run.yaml", overrides=["tolerate_failed.pairs=0.5"], say=quiet, in_place=True)
     assert record_of(here)["exit_code"] == 0
 
 
@@ -437,12 +437,12 @@ def test_what_builds_on_a_failed_stage_is_skipped(here: Path) -> None:
         ("evaluate", {"pairs": "ios"}, "pairs: found 'ios'"),
         ("evaluate", {"pairs": [["ios"]]}, "pairs"),
         ("embed", {"batch_size": 0.5}, "batch_size"),
-        ("own_images", {"device": 5}, "device: found 5, expected a str such as 'ios'"),
-        ("own_images", {"unit_m": "cm"}, "unit_m: found 'cm', expected None or a number such as 1.0"),
+        ("own_images", {"device": 5}, "device.*: found 5"),
+        ("own_images", {"unit_m": "cm"}, "unit_m: found 'cm'"),
         ("own_images", {"unit_m": True}, "unit_m: found True"),
-        ("compare", {"runs": "../runs/a"}, "runs: found '../runs/a', expected None or a list of run folders"),
-        ("compare", {"runs": [5]}, r"runs: found \[5\]"),
-        ("compare", {"pictures": "two"}, "pictures: found 'two', expected a whole number, 0 or more"),
+        ("compare", {"runs": "../runs/a"}, "runs: found '../runs/a'"),
+        ("compare", {"runs": [5]}, r"runs.*: found 5"),
+        ("compare", {"pictures": "two"}, "pictures: found 'two'"),
         ("compare", {"seed": -1}, "seed: found -1"),
     ],
 )
@@ -464,7 +464,6 @@ def test_notebook_parameters_as_committed_fit(name: str) -> None:
 @pytest.mark.parametrize(
     ("variables", "said"),
     [
-        ({"poses_are": "cam_from_wrld"}, "poses_are: found 'cam_from_wrld'. Did you mean 'cam_from_world'. Known"),
         ({"In": ["# Parameters\nquery_image = 'x'\n"]}, "query_image: 00_own_images.ipynb has no such parameter"),
         ({"map_images": 5}, "map_images: found 5"),
     ],
@@ -475,14 +474,14 @@ def test_a_notebook_that_is_no_stage_looks_at_its_parameters(
     shell = SimpleNamespace(user_ns=variables)
     monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
     with pytest.raises(ManifestError, match=said):
-        notebook.check_given("own_images", poses_are=POSE_DIRECTIONS)
+        notebook.check_given("own_images")
 
 
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        ({"map_device": "all", "query_device": "oss"}, r"query_device: found 'oss', .*Did you mean 'ios'"),
-        ({"queries": "keyframes_evry"}, r"queries: found 'keyframes_evry', .*Did you mean 'keyframes_every'"),
+        ({"map_device": "all", "query_device": "oss"}, r"device 'oss'.*: ios"),
+        ({"queries": "keyframes_evry"}, r"'keyframes_evry'.*every"),
     ],
 )
 def test_a_notebook_looks_for_what_it_is_asked_before_earlier_stages_are_made(

@@ -15,6 +15,7 @@ from typing import Annotated, Any
 
 try:
     import typer
+    from typer import Argument, Option
 
     from toolkit.errors import ArtifactError, IncompleteError, ManifestError, ToolkitError, exit_code, sentence
 except ModuleNotFoundError as missing:  # users may run `python -m toolkit` with the wrong Python
@@ -41,68 +42,42 @@ MOST_LETTERS = 100
 USAGE, INTERRUPTED = 2, 130
 """Exit codes of typer: a wrong option; Ctrl-C."""
 
-Device = Annotated[str, typer.Option(help="Device type: ios, hl, spot or another name.")]
-Placing = Annotated[str, typer.Option("--images", metavar="link|copy", help="Link to the images, or copy them.")]
-Run = Annotated[Path, typer.Argument(help="Run folder.")]
-Scene = Annotated[str, typer.Argument(help="Name of the capture.")]
-MapDevice = Annotated[str, typer.Argument(help="Map device.")]
-QueryDevice = Annotated[str, typer.Argument(help="Query device.")]
-TextFile = Annotated[Path, typer.Argument(help="Text file.")]
-Axes = Annotated[
-    str,
-    typer.Option(
-        "--axes",
-        metavar="opencv|opengl",
-        help="Camera axes of the poses. opencv: x right, y down, z forward; opengl: x right, y up, z backward.",
-    ),
+Device = Annotated[str, Option(help="Device type: ios, hl, spot or another name.")]
+Placing = Annotated[str, Option("--images", metavar="link|copy", help="Link to the images, or copy them.")]
+Run = Annotated[Path, Argument(help="Run folder.")]
+Scene = Annotated[str, Argument(help="Name of the capture.")]
+MapDevice = Annotated[str, Argument(help="Map device.")]
+QueryDevice = Annotated[str, Argument(help="Query device.")]
+TextFile = Annotated[Path, Argument(help="Text file.")]
+_AXES = "Camera axes of the poses. opencv: x right, y down, z forward; opengl: x right, y up, z backward."
+Axes = Annotated[str, Option("--axes", metavar="opencv|opengl", help=_AXES)]
+_NAMES = "Name imported images as in your folder (own), or as in the capture (capture)."
+Names = Annotated[str, Option("--names", metavar="own|capture", help=_NAMES)]
+Settings = Annotated[
+    list[str] | None, Option("--set", metavar="KEY=VALUE", help="Replace a setting; `run`: in a new run.")
 ]
-Names = Annotated[
-    str,
-    typer.Option(
-        "--names",
-        metavar="own|capture",
-        help="Name imported images as in your folder (own), or as in the capture (capture).",
-    ),
-]
-Capture = Annotated[Path | None, typer.Option(help="Capture folder, if it has moved since the run.")]
-Json = Annotated[
-    bool, typer.Option("--json", help="Print only a summary as JSON to stdout, everything else to stderr.")
-]
+Capture = Annotated[Path | None, Option(help="Capture folder, if it has moved since the run.")]
+Json = Annotated[bool, Option("--json", help="Print only a summary as JSON to stdout, everything else to stderr.")]
+_CLUSTER = "Dask workers: N on this machine, of a scheduler, or started by a cluster's queue (see docs/scaling.md)."
+_SWEEP = "Run once per value, each in its own folder, and compare. Repeat it to run all combinations."
+_FAILED = (
+    "What to write for a query without a pose. `nearest`, the default: the pose of its best retrieved reference, as "
+    "recall counts a missing pose as a miss, so a rough pose cannot reduce it, and the submission is complete. The "
+    "description gives the number of such queries, and submission.csv lists them. `leave-out`: nothing."
+)
+_TABLE = "CSV with a header: image; qw,qx,qy,qz,tx,ty,tz for poses; camera_id, or model,width,height,params."
 
 
 @app.command()
 def run(
-    manifest: Annotated[Path, typer.Argument(help="Manifest, for example data_manifests/demo.yaml.")],
-    only: Annotated[str | None, typer.Option(metavar="STAGE", help="Run only this stage.")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Also run stages that are up to date.")] = False,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="KEY=VALUE", help="Replace a setting, e.g. localize.method=nearest; in a run of its own."
-        ),
-    ] = None,
-    name: Annotated[
-        str | None, typer.Option(help="Name of the run folder; default: the manifest's, with what --set changes.")
-    ] = None,
-    in_place: Annotated[
-        bool, typer.Option("--in-place", help="With --set: replace the results of the manifest's own run.")
-    ] = False,
-    cluster: Annotated[
-        str | None,
-        typer.Option(
-            metavar="local[:N]|tcp://HOST:PORT|slurm:FILE",
-            help="Run on Dask workers: N on this machine, those of a scheduler, or workers started by a cluster's "
-            "queue (see docs/scaling.md).",
-        ),
-    ] = None,
-    sweeps: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--sweep",
-            metavar="KEY=A,B,C",
-            help="Run once per value, each in its own folder, and compare. Repeat it to run all combinations.",
-        ),
-    ] = None,
+    manifest: Annotated[Path, Argument(help="Manifest, for example data_manifests/demo.yaml.")],
+    only: Annotated[str | None, Option(metavar="STAGE", help="Run only this stage.")] = None,
+    force: Annotated[bool, Option("--force", help="Also run stages that are up to date.")] = False,
+    overrides: Settings = None,
+    name: Annotated[str | None, Option(help="Name of the run folder; default: says what --set changes.")] = None,
+    in_place: Annotated[bool, Option("--in-place", help="With --set: replace the manifest's own results.")] = False,
+    cluster: Annotated[str | None, Option(metavar="local[:N]|tcp://HOST:PORT|slurm:FILE", help=_CLUSTER)] = None,
+    sweeps: Annotated[list[str] | None, Option("--sweep", metavar="KEY=A,B,C", help=_SWEEP)] = None,
     as_json: Json = False,
 ) -> None:
     """Run the notebooks of a manifest, skip what is up to date, and write a report.
@@ -111,15 +86,16 @@ def run(
     failed than the manifest tolerates (`tolerate_failed`); 3 a bug; 130 or 143 interrupted.
     """
     from toolkit import pipeline
-    from toolkit.runs.record import summary
+    from toolkit.runs.folder import summary
 
     tell = partial(print, file=sys.stderr) if as_json else print
     try:
         if sweeps and (name or in_place):
             raise ManifestError("--sweep names its runs itself: leave out --name and --in-place.")
         if sweeps:
-            options = {"only": only, "force": force, "cluster": cluster}
-            _sweep(manifest, sweeps, overrides or (), tell, as_json, **options)
+            _compare_swept(
+                *pipeline.sweep(manifest, sweeps, overrides or (), tell, only, force, cluster), tell, as_json
+            )
             return
         run_dir = pipeline.run(manifest, only, force, overrides or (), tell, cluster, name, in_place)
     except BaseException as error:
@@ -138,12 +114,10 @@ def run(
 
 @app.command()
 def compare(
-    runs: Annotated[list[Path], typer.Argument(help="Two or more run folders, compared with the first.")],
-    out: Annotated[
-        Path | None, typer.Option(help="HTML file, the notebook beside it; else compare_<names>.html by the first run.")
-    ] = None,
-    pictures: Annotated[int, typer.Option(min=0, help="Number of queries won or lost to draw, per run.")] = 4,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the resampling for the intervals.")] = 0,
+    runs: Annotated[list[Path], Argument(help="Two or more run folders, compared with the first.")],
+    out: Annotated[Path | None, Option(help="HTML file; default: compare_<names>.html by the first run.")] = None,
+    pictures: Annotated[int, Option(min=0, help="Number of queries won or lost to draw, per run.")] = 4,
+    seed: Annotated[int, Option(min=0, help="Seed of the resampling for the intervals.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Compare runs: recall with intervals, queries won and lost, time, memory, settings. Write notebook and page."""
@@ -151,7 +125,7 @@ def compare(
 
 
 @app.command()
-def settings(stage: Annotated[str, typer.Argument(help="Only this stage, e.g. localize.")] = "") -> None:
+def settings(stage: Annotated[str, Argument(help="Only this stage, e.g. localize.")] = "") -> None:
     """Show all settings of a manifest with their meanings and defaults, as YAML to copy into a manifest."""
     from toolkit.manifest import STAGES, Manifest, describe, nearest
 
@@ -164,7 +138,7 @@ def settings(stage: Annotated[str, typer.Argument(help="Only this stage, e.g. lo
 
 
 @app.command()
-def report(run_dir: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, for example runs/demo.")]) -> None:
+def report(run_dir: Annotated[Path, Argument(metavar="RUN", help="Run folder, for example runs/demo.")]) -> None:
     """Write the report of a run again from its folder."""
     from toolkit.report.page import write_report
 
@@ -173,8 +147,8 @@ def report(run_dir: Annotated[Path, typer.Argument(metavar="RUN", help="Run fold
 
 @app.command()
 def check(
-    capture: Annotated[Path, typer.Argument(help="Capture folder, with sessions/ in it.")],
-    deep: Annotated[bool, typer.Option("--deep", help="Decode the images completely, not only their headers.")] = False,
+    capture: Annotated[Path, Argument(help="Capture folder, with sessions/ in it.")],
+    deep: Annotated[bool, Option("--deep", help="Decode the images completely, not only their headers.")] = False,
     as_json: Json = False,
 ) -> None:
     """Show the content of a capture and all its inconsistencies, with file and line."""
@@ -191,11 +165,9 @@ def check(
 
 @app.command()
 def new(
-    name: Annotated[str, typer.Argument(help="Name of the manifest and its run, runs/<name>: letters, digits, -, _.")],
-    capture: Annotated[
-        Path | None, typer.Argument(help="Capture folder, with sessions/ in it; default: a placeholder to fill in.")
-    ] = None,
-    out: Annotated[Path, typer.Option(help="Folder of the manifest.")] = Path("data_manifests"),
+    name: Annotated[str, Argument(help="Name of the manifest and its run, runs/<name>: letters, digits, -, _.")],
+    capture: Annotated[Path | None, Argument(help="Capture folder; default: a placeholder to fill in.")] = None,
+    out: Annotated[Path, Option(help="Folder of the manifest.")] = Path("data_manifests"),
 ) -> None:
     """Write a manifest for a capture, with explanations and the findings of `check`."""
     from toolkit.exchange.new_manifest import new_manifest
@@ -206,26 +178,15 @@ def new(
 
 @app.command()
 def submit(
-    runs: Annotated[list[Path], typer.Argument(help="Run folders; scenes may be distributed over several.")],
-    description: Annotated[
-        str, typer.Option(metavar="TEXT|FILE", help="Description: method, thresholds, link to the code.")
-    ] = "",
-    out: Annotated[Path | None, typer.Option(help="Zip file; default: RUN/submission.zip.")] = None,
-    failed: Annotated[
-        str,
-        typer.Option(
-            metavar="nearest|leave-out",
-            help="What to write for a query without a pose. `nearest`: the pose of its best retrieved reference. This "
-            "is the default: recall counts a missing pose as a miss, so a rough pose cannot reduce it, and the "
-            "submission is complete. The description gives the number of such queries, and submission.csv lists them. "
-            "`leave-out`: nothing; the zip then has only localized queries.",
-        ),
-    ] = "nearest",
-    queries: Annotated[str | None, typer.Option(help="List of the query keyframes; default: the challenge's.")] = None,
-    scene: Annotated[list[str] | None, typer.Option(help="Only this scene; repeat for more.")] = None,
-    capture: Annotated[list[Path] | None, typer.Option(help="Capture folder, if it has moved since the run.")] = None,
-    sequence: Annotated[bool, typer.Option("--sequence", help="Use the poses of the stage `sequence`.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would be in the zip, write nothing.")] = False,
+    runs: Annotated[list[Path], Argument(help="Run folders; scenes may be distributed over several.")],
+    description: Annotated[str, Option(metavar="TEXT|FILE", help="Method, thresholds, link to the code.")] = "",
+    out: Annotated[Path | None, Option(help="Zip file; default: RUN/submission.zip.")] = None,
+    failed: Annotated[str, Option(metavar="nearest|leave-out", help=_FAILED)] = "nearest",
+    queries: Annotated[str | None, Option(help="List of the query keyframes; default: the challenge's.")] = None,
+    scene: Annotated[list[str] | None, Option(help="Only this scene; repeat for more.")] = None,
+    capture: Annotated[list[Path] | None, Option(help="Capture folder, if it has moved since the run.")] = None,
+    sequence: Annotated[bool, Option("--sequence", help="Use the poses of the stage `sequence`.")] = False,
+    dry_run: Annotated[bool, Option("--dry-run", help="Show what would be in the zip, write nothing.")] = False,
 ) -> None:
     """Check the poses of runs and write the zip file for the challenge; list missing pairs."""
     from toolkit.exchange.submission import collect
@@ -240,36 +201,31 @@ def submit(
 
 @app.command()
 def download(
-    manifest: Annotated[Path, typer.Argument(help="Manifest with `dataset`, as data_manifests/crocodl-hydro.yaml.")],
-    sessions: Annotated[
-        str, typer.Option(metavar="NAME,...", help="Only these sessions of the manifest, e.g. ios_map,hl_query.")
-    ] = "",
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="List files and sizes; fetch nothing.")] = False,
-    keep_archives: Annotated[bool, typer.Option("--keep-archives", help="Keep archives after unpacking.")] = False,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Replace a setting, as for `run`.")
-    ] = None,
+    manifest: Annotated[Path, Argument(help="Manifest with `dataset`, as data_manifests/crocodl-hydro.yaml.")],
+    sessions: Annotated[str, Option(metavar="NAME,...", help="Only these, e.g. ios_map,hl_query.")] = "",
+    dry_run: Annotated[bool, Option("--dry-run", help="List files and sizes; fetch nothing.")] = False,
+    overrides: Settings = None,
 ) -> None:
     """Download, unpack and check the captures of a manifest; resume a stopped download."""
     from toolkit.exchange.download import download
 
     names = [name.strip() for name in sessions.split(",") if name.strip()]
-    reports = download(manifest, names, keep_archives, dry_run, overrides or ())
+    reports = download(manifest, names, dry_run, overrides or ())
     if not all(report.ok for report in reports):
         raise typer.Exit(1)
 
 
 @app.command()
 def demo_data(
-    out: Annotated[Path, typer.Option(help="Capture folder to write.")],
-    rooms: Annotated[int, typer.Option(min=1, help="Number of rooms.")] = 2,
-    frames: Annotated[int, typer.Option(min=2, help="Frames per room and map session.")] = 12,
-    seed: Annotated[int, typer.Option(min=0, help="Random seed; another seed gives other rooms.")] = 0,
-    alike: Annotated[bool, typer.Option("--alike", help="The last room looks exactly like the first.")] = False,
-    seconds: Annotated[int, typer.Option(min=0, help="Length of a query recording; adds odometry between images.")] = 0,
-    losses: Annotated[int, typer.Option(min=0, help="Tracking losses per query recording.")] = 0,
-    gaps: Annotated[int, typer.Option(min=0, help="Gaps of 4 s in the odometry of a query recording.")] = 0,
-    radio: Annotated[bool, typer.Option("--radio", help="Add scans of WiFi and Bluetooth.")] = False,
+    out: Annotated[Path, Option(help="Capture folder to write.")],
+    rooms: Annotated[int, Option(min=1, help="Number of rooms.")] = 2,
+    frames: Annotated[int, Option(min=2, help="Frames per room and map session.")] = 12,
+    seed: Annotated[int, Option(min=0, help="Random seed; another seed gives other rooms.")] = 0,
+    alike: Annotated[bool, Option("--alike", help="The last room looks exactly like the first.")] = False,
+    seconds: Annotated[int, Option(min=0, help="Length of a query recording; adds odometry between images.")] = 0,
+    losses: Annotated[int, Option(min=0, help="Tracking losses per query recording.")] = 0,
+    gaps: Annotated[int, Option(min=0, help="Gaps of 4 s in the odometry of a query recording.")] = 0,
+    radio: Annotated[bool, Option("--radio", help="Add scans of WiFi and Bluetooth.")] = False,
 ) -> None:
     """Render a capture with exact ground truth, for demos, tests and benchmarks."""
     from toolkit.synthetic import render_capture
@@ -282,11 +238,11 @@ def demo_data(
 
 @import_app.command("colmap")
 def import_colmap(
-    model: Annotated[Path, typer.Argument(help="Folder with cameras, images, points3D as .bin or .txt.")],
-    images: Annotated[Path, typer.Argument(help="Folder that the model's image names are relative to.")],
-    capture: Annotated[Path, typer.Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
+    model: Annotated[Path, Argument(help="Folder with cameras, images, points3D as .bin or .txt.")],
+    images: Annotated[Path, Argument(help="Folder that the model's image names are relative to.")],
+    capture: Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
     device: Device = "ios",
-    split: Annotated[str, typer.Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
+    split: Annotated[str, Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
     placing: Placing = "link",
 ) -> None:
     """Make a session from a COLMAP model: cameras, poses, rigs."""
@@ -297,28 +253,21 @@ def import_colmap(
 
 @import_app.command("images")
 def import_images(
-    images: Annotated[Path, typer.Argument(help="Folder of JPEG and PNG files.")],
-    capture: Annotated[Path, typer.Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
+    images: Annotated[Path, Argument(help="Folder of JPEG and PNG files.")],
+    capture: Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
     device: Device = "ios",
-    split: Annotated[str, typer.Option(metavar="map|query", help="A map needs a table with poses.")] = "query",
-    table: Annotated[
-        Path | None,
-        typer.Option(
-            help="CSV with a header: image; qw,qx,qy,qz,tx,ty,tz for poses; camera_id, or model,width,height,params."
-        ),
-    ] = None,
+    split: Annotated[str, Option(metavar="map|query", help="A map needs a table with poses.")] = "query",
+    table: Annotated[Path | None, Option(help=_TABLE)] = None,
     poses_are: Annotated[
-        str, typer.Option(metavar="world_from_cam|cam_from_world", help="Direction of the table's poses.")
+        str, Option(metavar="world_from_cam|cam_from_world", help="Direction of the table's poses.")
     ] = "world_from_cam",
     axes: Axes = "opencv",
-    unit: Annotated[float, typer.Option(metavar="METERS", help="Meters per unit of the poses, e.g. 0.01.")] = 1.0,
-    truth: Annotated[
-        Path | None, typer.Option(help="CSV like the table, with ground-truth poses of the queries, for evaluation.")
-    ] = None,
+    unit: Annotated[float, Option(metavar="METERS", help="Meters per unit of the poses, e.g. 0.01.")] = 1.0,
+    truth: Annotated[Path | None, Option(help="CSV like the table, with ground-truth poses of queries.")] = None,
     camera: Annotated[
-        str | None, typer.Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all images; else guessed from EXIF.")
+        str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all images; else guessed from EXIF.")
     ] = None,
-    cameras: Annotated[Path | None, typer.Option(help="COLMAP's cameras.txt.")] = None,
+    cameras: Annotated[Path | None, Option(help="COLMAP's cameras.txt.")] = None,
     placing: Placing = "link",
 ) -> None:
     """Make a session from a folder of images: a map with poses, or queries."""
@@ -332,14 +281,12 @@ def import_images(
 
 @import_app.command("transforms")
 def import_transforms(
-    transforms: Annotated[Path, typer.Argument(help="transforms.json of nerfstudio or instant-ngp, near its images.")],
-    capture: Annotated[Path, typer.Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
+    transforms: Annotated[Path, Argument(help="transforms.json of nerfstudio or instant-ngp, near its images.")],
+    capture: Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
     device: Device = "ios",
-    split: Annotated[str, typer.Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
-    hold_out: Annotated[
-        int, typer.Option(metavar="N", help="Every Nth image becomes a query with ground truth; 0: none.")
-    ] = 0,
-    unit: Annotated[float | None, typer.Option(metavar="METERS", help="Meters per unit of the poses if known.")] = None,
+    split: Annotated[str, Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
+    hold_out: Annotated[int, Option(metavar="N", help="Every Nth image becomes a query with truth; 0: none.")] = 0,
+    unit: Annotated[float | None, Option(metavar="METERS", help="Meters per unit of the poses if known.")] = None,
     axes: Axes = "opengl",
     placing: Placing = "link",
 ) -> None:
@@ -354,8 +301,8 @@ def import_transforms(
 def export_colmap(
     run: Run,
     scene: Scene,
-    device: Annotated[str, typer.Argument(help="Map device, e.g. ios.")],
-    out: Annotated[Path, typer.Argument(help="New folder for the model.")],
+    device: Annotated[str, Argument(help="Map device, e.g. ios.")],
+    out: Annotated[Path, Argument(help="New folder for the model.")],
     capture: Capture = None,
     names: Names = "own",
 ) -> None:
@@ -372,7 +319,7 @@ def export_pairs(
     map_device: MapDevice,
     query_device: QueryDevice,
     out: TextFile,
-    topk: Annotated[int | None, typer.Option(min=1, help="References per query; default: all.")] = None,
+    topk: Annotated[int | None, Option(min=1, help="References per query; default: all.")] = None,
     names: Names = "own",
 ) -> None:
     """Write the retrieval of a pair in hloc's format: `query reference` per line."""
@@ -381,45 +328,40 @@ def export_pairs(
     print(f"{out}: {export.export_pairs(run, scene, map_device, query_device, out, topk, names)} pairs")
 
 
-@export_app.command("poses")
-def export_poses(
-    run: Run,
-    scene: Scene,
-    map_device: MapDevice,
-    query_device: QueryDevice,
-    out: TextFile,
-    capture: Capture = None,
-    names: Names = "own",
-) -> None:
-    """Write the poses of a pair's queries in hloc's format: `name qw qx qy qz tx ty tz` per line, cam_from_world."""
-    from toolkit.exchange import export
+def _export_of_pair(what: str, unit: str) -> Callable[..., None]:
+    def export(
+        run: Run,
+        scene: Scene,
+        map_device: MapDevice,
+        query_device: QueryDevice,
+        out: TextFile,
+        capture: Capture = None,
+        names: Names = "own",
+    ) -> None:
+        from toolkit.exchange import export
 
-    print(f"{out}: {export.export_poses(run, scene, map_device, query_device, out, capture, names)} poses")
+        function = getattr(export, f"export_{what}")
+        print(f"{out}: {function(run, scene, map_device, query_device, out, capture, names)} {unit}")
+
+    return export
 
 
-@export_app.command("intrinsics")
-def export_intrinsics(
-    run: Run,
-    scene: Scene,
-    map_device: MapDevice,
-    query_device: QueryDevice,
-    out: TextFile,
-    capture: Capture = None,
-    names: Names = "own",
-) -> None:
-    """Write the cameras of a pair's queries in hloc's format: `name MODEL width height parameters` per line."""
-    from toolkit.exchange import export
-
-    print(f"{out}: {export.export_intrinsics(run, scene, map_device, query_device, out, capture, names)} images")
+for _what, _unit, _help in (
+    ("poses", "poses", "Write the poses of a pair's queries in hloc's format: `name qw qx qy qz tx ty tz` per line, "
+     "cam_from_world."),
+    ("intrinsics", "images", "Write the cameras of a pair's queries in hloc's format: `name MODEL width height "
+     "parameters` per line."),
+):  # fmt: skip
+    export_app.command(_what, help=_help)(_export_of_pair(_what, _unit))
 
 
 @export_app.command("features")
 def export_features(
     run: Run,
     scene: Scene,
-    session: Annotated[str, typer.Argument(help="Session, e.g. ios_map.")],
-    out: Annotated[Path, typer.Argument(help="HDF5 file.")],
-    kind: Annotated[str, typer.Option(help="Kind of features.")] = "sift",
+    session: Annotated[str, Argument(help="Session, e.g. ios_map.")],
+    out: Annotated[Path, Argument(help="HDF5 file.")],
+    kind: Annotated[str, Option(help="Kind of features.")] = "sift",
 ) -> None:
     """Write the local features of a session in hloc's format."""
     from toolkit.exchange import hloc
@@ -431,10 +373,10 @@ def export_features(
 def export_matches(
     run: Run,
     scene: Scene,
-    session0: Annotated[str, typer.Argument(help="Session of the first images, e.g. ios_map.")],
-    session1: Annotated[str, typer.Argument(help="Session of the second images; the same for the pairs of a map.")],
-    out: Annotated[Path, typer.Argument(help="HDF5 file.")],
-    kind: Annotated[str, typer.Option(help="Kind of features.")] = "sift",
+    session0: Annotated[str, Argument(help="Session of the first images, e.g. ios_map.")],
+    session1: Annotated[str, Argument(help="Session of the second images; the same for the pairs of a map.")],
+    out: Annotated[Path, Argument(help="HDF5 file.")],
+    kind: Annotated[str, Option(help="Kind of features.")] = "sift",
 ) -> None:
     """Write the matches of two sessions in hloc's format."""
     from toolkit.exchange import hloc
@@ -444,19 +386,19 @@ def export_matches(
 
 @app.command()
 def record(
-    scene: Annotated[Path, typer.Argument(help="Capture folder, with sessions/ in it.")],
-    device: Annotated[str, typer.Option(help="ios, hl or spot.")],
-    split: Annotated[str, typer.Option(help="map or query.")] = "map",
-    subsession: Annotated[str, typer.Option(help="One subsession, or all.")] = "all",
-    keyframes_only: Annotated[bool, typer.Option("--keyframes-only", help="Only the query keyframes.")] = False,
-    every: Annotated[int, typer.Option(min=1, help="Record only every Nth frame.")] = 1,
-    spawn: Annotated[bool, typer.Option("--spawn", help="Open the viewer when done.")] = False,
+    scene: Annotated[Path, Argument(help="Capture folder, with sessions/ in it.")],
+    device: Annotated[str, Option(help="ios, hl or spot.")],
+    split: Annotated[str, Option(help="map or query.")] = "map",
+    subsession: Annotated[str, Option(help="One subsession, or all.")] = "all",
+    keyframes_only: Annotated[bool, Option("--keyframes-only", help="Only the query keyframes.")] = False,
+    every: Annotated[int, Option(min=1, help="Record only every Nth frame.")] = 1,
+    spawn: Annotated[bool, Option("--spawn", help="Open the viewer when done.")] = False,
     vis_retrieve_queries: Annotated[
-        bool, typer.Option("--vis-retrieve-queries", help="Connect queries with the references that localized them.")
+        bool, Option("--vis-retrieve-queries", help="Connect queries with the references that localized them.")
     ] = False,
-    queries_pose: Annotated[Path | None, typer.Option(help="Trajectories file with the poses of queries.")] = None,
-    map_dir: Annotated[Path | None, typer.Option(help="Folder of triangulated maps, to show their points.")] = None,
-    out: Annotated[Path | None, typer.Option(help="File to write, .rrd.")] = None,
+    queries_pose: Annotated[Path | None, Option(help="Trajectories file with the poses of queries.")] = None,
+    map_dir: Annotated[Path | None, Option(help="Folder of triangulated maps, to show their points.")] = None,
+    out: Annotated[Path | None, Option(help="File to write, .rrd.")] = None,
 ) -> None:
     """Record a session for the rerun viewer: images on a timeline, cameras, depth and points."""
     from toolkit.viewer.sessions import record_session
@@ -471,20 +413,15 @@ def record(
     print(f"Open it: {rrd.command}")
 
 
-def _sweep(
-    manifest: Path, sweeps: Sequence[str], overrides: Sequence[str], tell: Callable[..., None], as_json: bool,
-    **options: Any,
-) -> None:  # fmt: skip
-    """Run a manifest with each combination of values, and compare the finished runs."""
-    from toolkit import pipeline
-    from toolkit.runs.record import summary
+def _compare_swept(folders: list[Path], errors: list[ToolkitError], tell: Callable[..., None], as_json: bool) -> None:
+    """Compare the finished runs of a sweep, and raise the first error."""
+    from toolkit.runs.folder import summary
 
-    folders, errors = pipeline.sweep(manifest, sweeps, overrides, tell, **options)
     for result in map(summary, folders):
         if result["exit_code"] != 0:
             errors.append(IncompleteError(f"{result['name']}: {result['error']}"))
-    as_json = as_json and not errors  # if there is an error, stdout has its JSON instead
     if len(folders) > 1:
+        as_json = as_json and not errors  # if there is an error, stdout has its JSON instead
         try:
             _compare(folders, tell, as_json)
         except ArtifactError as error:  # not evaluated (`--only`), or without ground truth
@@ -496,10 +433,8 @@ def _sweep(
         raise errors[0]
 
 
-def _compare(
-    runs: list[Path], tell: Callable[..., None], as_json: bool, out: Path | None = None, pictures: int = 4,
-    seed: int = 0,
-) -> None:  # fmt: skip
+def _compare(runs: list[Path], tell: Callable[..., None], as_json: bool, out: Path | None = None, pictures: int = 4,
+             seed: int = 0) -> None:  # fmt: skip
     """Compare runs and print the result; execute the notebook on them, and write it as a page."""
     from toolkit.notebook import execute, notebook_path, write_page
     from toolkit.report.comparison import compare_runs
@@ -520,17 +455,16 @@ def _compare(
 
 def _summary_of_stopped(manifest: Path, overrides: Sequence[str], name: str | None, in_place: bool) -> dict[str, Any]:
     """Return the summary of the run that this process started; empty if it had not started."""
-    from toolkit.files import read_json
     from toolkit.manifest import load_manifest
-    from toolkit.pipeline import own_run
-    from toolkit.runs.record import RECORD, summary
+    from toolkit.pipeline import run_name
+    from toolkit.runs.folder import summary
 
     with suppress(ToolkitError, OSError):
         content = load_manifest(manifest, overrides)
-        own = content.name if in_place else own_run(manifest, content, overrides, name)[0]
-        run_dir = Path(content.output_root) / own
-        if read_json(run_dir / RECORD).get("pid") == os.getpid():
-            return summary(run_dir)
+        own = content.name if in_place else run_name(manifest, content, overrides, name)[1]
+        result = summary(Path(content.output_root) / own)
+        if result.pop("pid") == os.getpid():
+            return result
     return {}
 
 

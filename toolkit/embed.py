@@ -57,7 +57,7 @@ def embed_sessions(
     out_dir: str | Path,
     settings: EmbedSettings | Mapping[str, Any] | None = None,
     *,
-    device: str = "auto",
+    device: str | Sequence[str] = "auto",
     subsession: str = "all",
     features_dir: str | Path | None = None,
     skip_existing: bool = True,
@@ -72,7 +72,7 @@ def embed_sessions(
         sessions_root: `<capture>/sessions`.
         out_dir: the embeddings folder; the vocabulary goes there too.
         settings: see `EmbedSettings`; a dict needs only the values that differ from the defaults.
-        device: `ios`, `hl`, `spot`, or `auto`: all devices of the capture.
+        device: `ios`, `hl`, `spot`, a list of them, or `auto`: all devices of the capture.
         subsession: one subsession's name, or `all`.
         features_dir: folder of the local features that stages share; None: `<out_dir>/../features`.
         skip_existing: reuse subsessions made from the same images and settings.
@@ -90,6 +90,9 @@ def embed_sessions(
     out_dir = Path(out_dir)
     features_dir = Path(features_dir) if features_dir is not None else out_dir.parent / "features"
     capture = Capture.from_sessions_root(sessions_root)
+    devices = capture.devices if device in ("auto", "all") else [device] if isinstance(device, str) else list(device)
+    if not {*devices} <= {*capture.devices}:
+        raise ManifestError(f"device is {device!r}; {capture.name} has {', '.join(capture.devices)} (or `auto`).")
     model = resolve_model(settings.model, settings.checkpoint)
     if settings.model == "auto":
         log.warning("model auto: %s", model)
@@ -105,7 +108,7 @@ def embed_sessions(
         own, other = (out_dir / name, out_dir) if several else (out_dir, out_dir / name)
         folders = _Folders(own, other, features_dir)
         model_settings = settings.model_copy(update={"model": name})
-        tables.append(_embed_with_model(capture, folders, model_settings, device, subsession, skip_existing))
+        tables.append(_embed_with_model(capture, folders, model_settings, devices, subsession, skip_existing))
     write_text(out_dir / "settings.json", settings.model_dump_json(indent=1) + "\n")
     return pd.concat(tables, ignore_index=True) if several else tables[0]
 
@@ -137,15 +140,20 @@ class _Folders:
 
 
 def _embed_with_model(
-    capture: Capture, folders: _Folders, settings: EmbedSettings, device: str, subsession: str, skip_existing: bool
+    capture: Capture,
+    folders: _Folders,
+    settings: EmbedSettings,
+    devices: list[str],
+    subsession: str,
+    skip_existing: bool,
 ) -> pd.DataFrame:
     out_dir, features_dir = folders.out, folders.features
-    parts, unreadable = _subsessions(capture, device, subsession)
+    parts, unreadable = _subsessions(capture, devices, subsession)
     embedder = _open_embedder(capture, settings, folders, skip_existing)
     if (turns := _turns(capture, embedder, settings)) is not None:
         parts = [replace(part, turns=turns.of(part.session, part.rows)) for part in parts]
     if subsession == "all":
-        names = [name for name in _session_names(capture, device) if name not in unreadable]
+        names = [name for name in _session_names(capture, devices) if name not in unreadable]
         _remove_former(out_dir, names, parts)
 
     @cache
@@ -233,17 +241,14 @@ def _turns(capture: Capture, embedder: Embedder, settings: EmbedSettings) -> Tur
     return upright_turns(capture, settings.world_up) if shows_upright(embedder, settings.upright) else None
 
 
-def _session_names(capture: Capture, device: str) -> list[str]:
-    devices = capture.devices if device in ("auto", "all") else [device]
+def _session_names(capture: Capture, devices: list[str]) -> list[str]:
     names = [f"{key}_{split}" for key in devices for split in ("map", "query")]
     return [name for name in names if name in capture]
 
 
-def _subsessions(capture: Capture, device: str, subsession: str) -> tuple[list[_Subsession], dict[str, str]]:
+def _subsessions(capture: Capture, devices: list[str], subsession: str) -> tuple[list[_Subsession], dict[str, str]]:
     """Return the subsessions to embed, without turns, and for each unreadable session the reason."""
-    if device not in ("auto", "all", *capture.devices):
-        raise ManifestError(f"device is {device!r}; {capture.name} has {', '.join(capture.devices)} (or `auto`).")
-    names = _session_names(capture, device)
+    names = _session_names(capture, devices)
     parts, unreadable = list[_Subsession](), dict[str, CaptureError]()
     for id_ in names:
         try:

@@ -6,7 +6,7 @@ import os
 import re
 import signal
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -21,6 +21,18 @@ _OF_THE_MACHINE = ("out of memory", "allocate memory", "insufficient memory", "n
 
 class ToolkitError(Exception):
     """Base of all errors that the command line prints without a traceback."""
+
+    @classmethod
+    def at(cls, place: object, found: str = "", expected: str = "", do: str = "") -> Self:
+        """Return the error `<place>: found <found>, expected <expected>. <do>`; empty parts are left out.
+
+        Args:
+            place: file and line, key, option or folder.
+            do: sentences that say what to do.
+        """
+        parts = [f"found {found}" if found else "", f"expected {expected}" if expected else ""]
+        said = ", ".join(part for part in parts if part)
+        return cls(f"{place}: " + " ".join(text for text in (said and f"{said}.", do) if text))
 
 
 class CaptureError(ToolkitError):

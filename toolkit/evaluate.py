@@ -304,9 +304,10 @@ def _read_results(path: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
     located, table = is_posed(poses), path.with_suffix(".csv")
     status = np.where(located, Status.OK, Status.FAILED).astype(object)
     results = keys.assign(pose=list(poses), status=status, **dict.fromkeys(DETAILS, np.nan))
-    if not table.is_file():  # another tool writes only poses; then every pose counts as ok
-        return results, "evaluated"
     try:
+        require_whole(table, of=path)
+        if not table.is_file():  # another tool writes only poses; then every pose counts as ok
+            return results, "evaluated"
         details = keys.merge(PairResults.open(path).table.drop_duplicates(_KEY), how="left", on=_KEY)
     except ArtifactError as error:
         return results, f"unreadable table of queries ({error})"

@@ -12,7 +12,7 @@ import re
 import secrets
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -218,15 +218,11 @@ def read_sidecar(path: str | Path) -> dict[str, Any] | None:
     """
     record = _read_record(path)
     settings = record.get("settings")
-    if record.get("version") != __version__ or record.get("unfinished") or not isinstance(settings, dict):
+    if record.get("version") != __version__ or record.get("unfinished") or not record.get("files"):
         return None
-    if not record.get("files"):  # written by a version without checksums
-        return None
-    damage = _damage(path, record)
-    whole = record.get("fingerprint") == fingerprint(settings)
-    if not damage and not (whole and record.get("sources", "") in ("", fingerprint(record.get("made_from")))):
-        damage = f"{sidecar_path(path)} is damaged"
-    if damage:
+    whole = isinstance(settings, dict) and record.get("fingerprint") == fingerprint(settings)
+    whole = whole and record.get("sources", "") in ("", fingerprint(record.get("made_from")))
+    if damage := _damage(path, record) or ("" if whole else f"{sidecar_path(path)} is damaged"):
         log.warning("%s: not reused.", damage)
     return None if damage else settings
 
@@ -248,10 +244,9 @@ def require_whole(path: str | Path, of: str | Path | None = None) -> None:
     """
     artifact = Path(of or path)
     if damage := _damage(artifact, _read_record(artifact), Path(path).name):
-        raise ArtifactError(
-            f"{damage}. Run the stage that makes it again. If it was changed on purpose, delete "
-            f"{sidecar_path(artifact)}: it is then used as it is."
-        )
+        record = sidecar_path(artifact)
+        text = f"Run the stage that makes it again. To use a file that was changed on purpose, delete {record}"
+        raise ArtifactError(f"{damage}. {text}.")
 
 
 def changed_sources(artifact: str | Path) -> list[Path]:
@@ -295,13 +290,8 @@ def require_current(artifact: str | Path, stage: str, suffixes: Iterable[str] = 
         raise ArtifactError(f"{Path(artifact).parent}: {why}")
 
 
-def older_files(folder: str | Path, stage: str, of: Callable[[str], bool] = lambda name: True) -> dict[str, str]:
-    """Return the files below a folder that are older than what they were made from, and why.
-
-    Args:
-        folder: folder of a stage's results.
-        stage: that stage.
-        of: selects artifacts by their path in the folder.
+def older_files(folder: str | Path, stage: str) -> dict[str, str]:
+    """Return the files of a stage below its folder that are older than what they were made from, and why.
 
     Returns:
         The sentence of `why_older`, by path in the folder, for all files of these artifacts.
@@ -309,8 +299,9 @@ def older_files(folder: str | Path, stage: str, of: Callable[[str], bool] = lamb
     older: dict[str, str] = {}
     for record in sorted(Path(folder).rglob("*.meta.json")):
         artifact = record.with_name(record.name.removesuffix(".meta.json"))
-        name = artifact.relative_to(folder).as_posix()
-        if of(name) and (why := why_older(artifact, stage, missing=stage not in ("retrieve", "rerank", "localize"))):
+        if stage in ("localize", "sequence") and of_sequence(artifact.name) != (stage == "sequence"):
+            continue  # the two write to one folder
+        if why := why_older(artifact, stage, missing=stage not in ("retrieve", "rerank", "localize")):
             files = _read_record(artifact).get("files", {})
             older |= {artifact.with_name(file).relative_to(folder).as_posix(): why for file in (artifact.name, *files)}
     return older
@@ -335,12 +326,6 @@ def _content(path: str | Path) -> str | None:
         return recorded if recorded and Path(path).stat().st_size == size else checksum(path)
     except (OSError, TypeError, ValueError, AttributeError, csv.Error):
         return None
-
-
-def any_unfinished(folder: str | Path, of: Callable[[str], bool]) -> bool:
-    """Tell whether any artifact below a folder, selected by its path in the folder, is recorded as unfinished."""
-    records = (path for path in Path(folder).rglob("*.meta.json") if of(path.relative_to(folder).as_posix()))
-    return any(_read_record(path.with_name(path.name.removesuffix(".meta.json"))).get("unfinished") for path in records)
 
 
 def _read_record(path: str | Path) -> dict[str, Any]:
@@ -406,6 +391,31 @@ class SceneFiles:
         self.poses_dir = self.root / "poses"
         self.evaluation = self.root / "evaluation"
         self.visualization = self.root / "visualization"
+
+    def of_stage(self, stage: str) -> Path | None:
+        """Return the folder of a stage's results; None if the stage writes only its executed notebook."""
+        return {
+            "embed": self.embeddings,
+            "retrieve": self.retrieval_dir,
+            "rerank": self.reranked_dir,
+            "localize": self.poses_dir,
+            "sequence": self.poses_dir,
+            "evaluate": self.evaluation,
+            "visualize": self.visualization,
+        }.get(stage)
+
+    def folders(self, stage: str) -> dict[str, Path]:
+        """Return the folders through which stages exchange results, by the names of the notebooks' parameters."""
+        out = self.of_stage(stage)
+        return {
+            "map_feats_root": self.embeddings,
+            "out_jsonl": self.retrieval_dir,
+            "retrieval_dir": self.retrieval_dir,
+            "features_dir": self.features,
+            "map_dir": self.maps,
+            "poses_dir": self.poses_dir,
+            **({"out_dir": out} if out else {}),
+        }
 
     def retrieval(self, map_device: str, query_device: str) -> Path:
         return self.retrieval_dir / f"{pair_name(self.scene, map_device, query_device)}.jsonl"
@@ -493,18 +503,16 @@ def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:
         ArtifactError: the file is missing or damaged, or a line is not such a row.
     """
     rows: list[dict[str, Any]] = []
-    keys, number = {"timestamp", "sensor_id", "topk", *needed}, 0
+    number = 0
     try:
         with open(path, encoding="utf-8") as lines:
             for line in lines:
                 number += 1
                 if line.strip():
-                    rows.append(_checked(json.loads(line), keys))
+                    rows.append(_checked(json.loads(line), {"timestamp", "sensor_id", "topk", *needed}))
     except FileNotFoundError:
-        raise ArtifactError(
-            f"No references: {path} is missing. Run the retrieve stage first "
-            "(python -m toolkit run MANIFEST --only retrieve)."
-        ) from None
+        do = "Run the retrieve stage first (python -m toolkit run MANIFEST --only retrieve)."
+        raise ArtifactError.at(path, "no such file of references", do=do) from None
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise ArtifactError(f"{path}, line {number}: not a retrieval row ({error}). Retrieve again.") from None
     require_whole(path)
@@ -513,10 +521,9 @@ def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:
 
 def _checked(row: Any, keys: set[str]) -> dict[str, Any]:
     if not isinstance(row, dict) or not keys <= row.keys():
-        found = sorted(row) if isinstance(row, dict) else row
-        raise ValueError(f"found {found!r}; expected the keys {', '.join(sorted(keys))} and others")
+        raise ValueError(f"found {str(row)[:80]}; expected the keys {', '.join(sorted(keys))} and others")
     if not isinstance(row["topk"], list):
-        raise TypeError(f"found topk {row['topk']!r}; expected a list of references")
+        raise TypeError("expected a list of references as topk")
     if not all(isinstance(reference, dict) and "path" in reference for reference in row["topk"]):
         raise ValueError("a reference in topk has no path")
     int(row["timestamp"])
@@ -568,9 +575,7 @@ def require_same(expected: Mapping[str, Any], here: Mapping[str, Any]) -> None:
         ToolkitError: names the settings that differ.
     """
     differing = [name for name in {**expected, **here} if expected.get(name) != here.get(name)]
-    if differing:
-        found = "; ".join(f"{name}: {here.get(name)} here, {expected.get(name)} there" for name in differing)
-        raise ToolkitError(
-            f"The worker on {platform.node()} has other settings than the main process ({found}). "
-            "Set them in the manifest, or use machines of one kind."
-        )
+    found = "; ".join(f"{name}: {here.get(name)} here, {expected.get(name)} there" for name in differing)
+    if found:
+        do = "Set them in the manifest, or use machines of one kind."
+        raise ToolkitError.at(f"worker on {platform.node()}", found, "the settings of the main process", do)

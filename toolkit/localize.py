@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from itertools import pairwise, product
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -84,6 +84,7 @@ def localize_pairs(
     *,
     map_device: str = "all",
     query_device: str = "all",
+    pairs: Sequence[Sequence[str]] | None = None,
     queries: str = "keyframes_pruned_subsampled",
     skip_existing: bool = True,
     workers: int = 0,
@@ -102,6 +103,7 @@ def localize_pairs(
         map_dir: folder of the triangulated maps, `<device>_map.npz`, and of matches.
         settings: see `LocalizeSettings`; a dict needs only the settings that differ from the defaults.
         map_device, query_device: `ios`, `hl`, `spot`, or `all` devices of the capture.
+        pairs: only these [map device, query device]; None: all of the chosen devices.
         queries: the keyframe list to localize, or `all`.
         skip_existing: reuse results of the same inputs and settings, and resume a killed run.
         workers: threads; 0: the number of cores.
@@ -124,7 +126,7 @@ def localize_pairs(
     capture, settings = stage.capture, stage.settings
     table = PairRows(capture.name, folders.out, folders.retrieval)
     query_tables: dict[str, list[pd.DataFrame]] = {}
-    devices = product(capture.devices_with("map", map_device), capture.devices_with("query", query_device))
+    devices = capture.pairs(map_device, query_device, pairs)
     with fixed_sums:
         for mapped, queried in devices:
             pair = _Pair(stage, mapped, queried)

@@ -11,16 +11,19 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tqdm.auto
 import tqdm.std
+from pydantic import ConfigDict, Field, NonNegativeInt, ValidationError, create_model
 
 from toolkit import errors
-from toolkit.errors import CaptureError, ManifestError, StageError, shortage
-from toolkit.files import SceneFiles, files_fingerprint, link_folder, older_files, read_json, write_text
+from toolkit.errors import ManifestError, StageError, shortage
+from toolkit.files import SceneFiles, link_folder, older_files, read_json, write_text
 from toolkit.manifest import (
     OPTIONAL,
     STAGES,
@@ -32,10 +35,10 @@ from toolkit.manifest import (
     Settings,
     nearest,
 )
-from toolkit.runs.folder import LOG_VARIABLE, log_to
+from toolkit.manifest.messages import explain
+from toolkit.runs.folder import LOG_VARIABLE, RECORD, log_to
 from toolkit.runs.kernel import TEXT_BARS, Kernels, MemoryWatch, kernel_error
 from toolkit.runs.pairs import left_out_of
-from toolkit.runs.record import RECORD
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -74,27 +77,21 @@ if TEXT_BARS in os.environ:
     tqdm.auto.tqdm = tqdm.std.tqdm
 
 
-class Folders:
+class Folders(SimpleNamespace):
     """The resolved folders of a notebook, as attributes; displayed as a table. `settings` are those of its stage."""
 
-    def __init__(self, folders: dict[str, Path], stage: str) -> None:
-        self._folders, self._stage = folders, stage
+    def __init__(self, stage: str, **folders: Path) -> None:
+        super().__init__(**folders)
+        self._stage = stage
 
     @property
     def settings(self) -> Any:
         """The settings model of the stage, from the notebook's parameters as they are now."""
         return stage_settings(self._stage, _user_names())
 
-    def __getattr__(self, name: str) -> Path:
-        folders = self.__dict__.get("_folders", {})
-        if name not in folders:
-            raise AttributeError(f"{name}: not a folder of this notebook. {nearest(name, folders)}")
-        path: Path = folders[name]
-        return path
-
     def __repr__(self) -> str:
-        width = max(len(name) for name in self._folders)
-        return "\n".join(f"{name:<{width}}  {path}" for name, path in self._folders.items())
+        folders = {name: path for name, path in vars(self).items() if name != "_stage"}
+        return "\n".join(f"{name:<{max(map(len, folders))}}  {path}" for name, path in folders.items())
 
 
 def start(stage: str, sessions_root: str | None = None, **folders: str | None) -> Folders:
@@ -123,26 +120,22 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
     files = SceneFiles(root / "runs" / f"{scene}-by-hand", scene)
     if None in folders.values():
         _take_from_run(stage, files)
-    defaults = {**stage_folders(files), "out_dir": stage_outputs(files, stage)}
+    defaults = files.folders(stage)
     _make_upstream(stage, sessions, files, {defaults[name] for name, folder in folders.items() if folder is None})
     resolved = {"sessions_root": sessions}
     for name, folder in folders.items():
-        path = Path(folder).expanduser().resolve() if folder else defaults[name]
-        if path is not None:
-            if folder and run_log is None and defaults[name] == defaults["out_dir"]:
-                _require_outside_of_runs(name, path, sessions)
-            resolved[name] = path
-    return Folders(resolved, stage)
+        resolved[name] = Path(folder).expanduser().resolve() if folder else defaults[name]
+        if folder and run_log is None and defaults[name] == files.of_stage(stage):
+            _require_outside_of_runs(name, resolved[name])
+    return Folders(stage, **resolved)
 
 
-def _require_outside_of_runs(name: str, folder: Path, sessions: Path) -> None:
+def _require_outside_of_runs(name: str, folder: Path) -> None:
     """Refuse a folder of results, the value of the parameter `name`, that belongs to a finished run."""
     run = next((parent for parent in folder.parents if (parent / RECORD).is_file()), None)
     if run is not None:
-        raise ManifestError(
-            f"{name}: {folder} belongs to the run {run}, which changes only by its manifest. Leave {name} out: results "
-            f"then go to {_root() / 'runs' / f'{sessions.parent.name}-by-hand'}. Or give another folder."
-        )
+        found = f"a folder of the run {run}, which changes only by its manifest"
+        raise ManifestError.at(name, found, do="Leave it out, or give another folder.")
 
 
 def sessions_or_demo(sessions_root: str | None) -> Path:
@@ -229,10 +222,8 @@ def notebook_path(stage: str) -> Path:
     """Return the notebook of a stage, `<number>_<stage>.ipynb`."""
     path = next(iter(sorted(NOTEBOOKS.glob(f"[0-9]*_{stage}.ipynb"))), None)
     if path is None:
-        raise ManifestError(
-            f"{NOTEBOOKS}: no notebook for the stage {stage}. The pipeline needs a clone of the repository: "
-            "install the toolkit there with `pip install --editable .`."
-        )
+        do = "Install the toolkit in a clone of its repository: `pip install --editable .`."
+        raise ManifestError.at(NOTEBOOKS, f"no notebook for the stage {stage}", do=do)
     return path
 
 
@@ -252,8 +243,8 @@ def notebook_parameters(path: Path) -> dict[str, Any]:
     raise ManifestError(f"{path}: no cell is tagged `parameters`.")
 
 
-def check_parameters(path: Path, parameters: Iterable[str], where: str = "") -> None:
-    """Refuse parameters that the notebook `path` does not have; papermill would only warn. Messages begin with `where`.
+def check_parameters(path: Path, parameters: Iterable[str]) -> None:
+    """Refuse parameters that the notebook `path` does not have; papermill would only warn.
 
     Raises:
         ManifestError: a parameter is unknown; the message names the nearest known one.
@@ -261,33 +252,7 @@ def check_parameters(path: Path, parameters: Iterable[str], where: str = "") -> 
     known = notebook_parameters(path)
     for name in parameters:
         if name not in known:
-            raise ManifestError(f"{where}{name}: {path.name} has no such parameter. {nearest(name, known)}")
-
-
-def stage_folders(files: SceneFiles) -> dict[str, Path]:
-    """Return the folders through which stages exchange results, by the names of the notebooks' parameters."""
-    return {
-        "map_feats_root": files.embeddings,
-        "out_jsonl": files.retrieval_dir,
-        "retrieval_dir": files.retrieval_dir,
-        "features_dir": files.features,
-        "map_dir": files.maps,
-        "poses_dir": files.poses_dir,
-        "evaluation_dir": files.evaluation,
-    }
-
-
-def stage_outputs(files: SceneFiles, stage: str) -> Path | None:
-    """Return the folder of a stage's results; None if the stage writes only its executed notebook."""
-    return {
-        "embed": files.embeddings,
-        "retrieve": files.retrieval_dir,
-        "rerank": files.reranked_dir,
-        "localize": files.poses_dir,
-        "sequence": files.poses_dir,
-        "evaluate": files.evaluation,
-        "visualize": files.visualization,
-    }.get(stage)
+            raise ManifestError(f"{name}: {path.name} has no such parameter. {nearest(name, known)}")
 
 
 _TAKEN = ".taken.json"
@@ -301,28 +266,22 @@ def _take_from_run(stage: str, files: SceneFiles) -> None:
     They lead to results of a finished run of the scene: the run called `<scene>`, or else the latest one. If that run
     changes, its new results are taken.
     """
-    taken, made_here = read_json(files.root / _TAKEN), stage_outputs(files, stage)
+    taken, made_here = read_json(files.root / _TAKEN), files.of_stage(stage)
     if made_here is not None:
         taken.pop(made_here.name, None)  # the links stay until the stage replaces them; from now on they are its own
     run = _finished_run(files.run.parent, files.scene)
-    donor = None if run is None else SceneFiles(run, files.scene).root
-    links = {} if donor is None else {name: (donor / name, files.root / name) for name in (*_RESULTS, *_CACHES)}
-    for name, (source, target) in links.items():
-        if not source.is_dir() or target == made_here or (target.exists() and name not in taken):
+    for name in (*_RESULTS, *_CACHES):
+        target = files.root / name
+        if run is None or target == made_here or (target.exists() and name not in taken):
             continue
-        state = f"{run} {_state(source)}"
-        if taken.get(name) != state:
+        source, state = run / files.scene / name, f"{run}, {read_json(run / RECORD).get('created')}"
+        if source.is_dir() and taken.get(name) != state:
             shutil.rmtree(target, ignore_errors=True)
             link_folder(source, target)
             taken |= {name: state} if name in _RESULTS else {}
             print(f"{name}: taken from {run}")
     if taken or (files.root / _TAKEN).exists():
         write_text(files.root / _TAKEN, json.dumps(taken) + "\n")
-
-
-def _state(folder: Path) -> str:
-    """Return a fingerprint of a folder's files."""
-    return files_fingerprint(sorted(path for path in folder.rglob("*") if path.is_file()))
 
 
 def _finished_run(runs: Path, scene: str) -> Path | None:
@@ -335,10 +294,10 @@ def _finished_run(runs: Path, scene: str) -> Path | None:
 def _make_upstream(stage: str, sessions: Path, files: SceneFiles, folders: set[Path | None]) -> None:
     """Run the earlier stages whose results `stage` needs and whose folder is in `folders` and empty or absent."""
     for name in UPSTREAM[stage]:
-        folder = stage_outputs(files, name)
+        folder = files.of_stage(name)
         if folder is None or name in OPTIONAL or folder not in folders:
             continue
-        _make_upstream(name, sessions, files, {stage_outputs(files, earlier) for earlier in UPSTREAM[name]})
+        _make_upstream(name, sessions, files, {files.of_stage(earlier) for earlier in UPSTREAM[name]})
         if not (folder.is_dir() and any(folder.iterdir())):
             print(f"{name}: no results yet, running it now into {folder}")
         elif older := older_files(folder, name):
@@ -353,20 +312,15 @@ def _run_stage(stage: str, sessions: Path, files: SceneFiles) -> None:
     run = _finished_run(files.run.parent, files.scene)
     content = read_json(run / RECORD).get("manifest", {}) if run else {}
     manifest = Manifest.of(content or {"name": "by-hand", "captures": [str(sessions.parent)]})
-    settings, queries = manifest.stage(stage).given(), manifest.queries
-    if stage == "embed":
-        from toolkit.embed import embed_sessions
-
-        embed_sessions(sessions, files.embeddings, settings)
-    elif stage == "retrieve":
-        from toolkit.retrieve import retrieve_pairs
-
-        retrieve_pairs(sessions, files.embeddings, files.retrieval_dir, settings, queries=queries)
-    else:
-        from toolkit.localize import localize_pairs
-
-        folders = (files.retrieval_dir, files.poses_dir, files.features, files.maps)
-        localize_pairs(sessions, *folders, settings, queries=queries)
+    folders = {
+        "embed": [files.embeddings],
+        "retrieve": [files.embeddings, files.retrieval_dir],
+        "localize": [files.retrieval_dir, files.poses_dir, files.features, files.maps],
+    }
+    name = "embed_sessions" if stage == "embed" else f"{stage}_pairs"
+    options = {} if stage == "embed" else {"queries": manifest.queries}
+    run_stage = getattr(import_module(f"toolkit.{stage}"), name)
+    run_stage(sessions, *folders[stage], manifest.stage(stage), **options)
 
 
 def _user_names() -> dict[str, Any]:
@@ -376,12 +330,11 @@ def _user_names() -> dict[str, Any]:
     return shell.user_ns if shell else {}
 
 
-def check_given(name: str, **choices: Iterable[str]) -> None:
+def check_given(name: str) -> None:
     """Refuse wrong parameter values in the running notebook, and unknown parameters that papermill has injected.
 
     Args:
         name: name of the notebook, `<number>_<name>.ipynb`.
-        **choices: the valid words of a parameter, by its name.
 
     Raises:
         ManifestError: names the parameter, what was found and what was expected.
@@ -391,9 +344,6 @@ def check_given(name: str, **choices: Iterable[str]) -> None:
         if source.startswith("# Parameters\n"):
             check_parameters(notebook_path(name), _literals(source))
     check_values(name, values)
-    for key, known in choices.items():
-        if key in values and values[key] not in known:
-            raise ManifestError(f"{key}: found {values[key]!r}. {nearest(values[key], known)}")
 
 
 def _check_devices_and_queries(stage: str, sessions: Path) -> None:
@@ -401,22 +351,15 @@ def _check_devices_and_queries(stage: str, sessions: Path) -> None:
     from toolkit.capture import Capture
 
     values, known = _user_names(), notebook_parameters(notebook_path(stage))
-    if "queries" in values and "queries" in known:
-        capture = Capture.from_sessions_root(sessions)
-        lists = {name for session in capture.usable("query") for name in session.keyframe_files}
-        short = str(values["queries"]).removesuffix(".txt").removeprefix("keyframes_")
-        if lists and short not in lists | {"all"}:
-            names = ["all", *(name if name == "queries" else f"keyframes_{name}" for name in lists)]
-            found = f"queries: found {values['queries']!r}, which no query session in {capture.path} has."
-            raise CaptureError(f"{found} {nearest(str(values['queries']), names)}")
+    asked = {name: values[name] for name in known if name in values}
+    capture = Capture.from_sessions_root(sessions) if asked else None
     for name, split in (("map_device", "map"), ("query_device", "query")):
-        if name not in values or name not in known:
-            continue
-        capture = Capture.from_sessions_root(sessions)
-        present = [device for device in capture.devices if f"{device}_{split}" in capture]
-        if values[name] not in (*present, "all", "auto"):
-            found = f"{name}: found {values[name]!r}, which has no {split} session in {capture.path}."
-            raise CaptureError(f"{found} {nearest(values[name], [*present, 'all'])}")
+        if capture and name in asked:
+            capture.devices_with(split, asked[name])
+    if capture and "queries" in asked and asked["queries"] != "all" and (recorded := capture.usable("query")):
+        short = str(asked["queries"]).removesuffix(".txt").removeprefix("keyframes_")
+        if not any(short in session.keyframe_files for session in recorded):
+            recorded[0].keyframes(asked["queries"])  # raises the error
 
 
 def stage_settings(stage: str, values: Mapping[str, Any]) -> Settings:
@@ -463,32 +406,29 @@ def check_values(name: str, values: Mapping[str, Any]) -> None:
     """
     path = notebook_path(name)
     checked = {"settings", *type(stage_settings(name, values)).model_fields} if name in STAGES else set()
-    for key, default in notebook_parameters(path).items():
-        if key in checked or key not in values:
-            continue
-        value = values[key]
-        if key == "pairs":
-            pairs = value if isinstance(value, list | tuple) else [value]
-            fits = value is None or all(isinstance(pair, list | tuple) and len(pair) == 2 for pair in pairs)
-            expected = 'None or a list such as [["ios", "hl"]]'
-        elif key == "runs":
-            listed = isinstance(value, list | tuple) and all(isinstance(run, str | Path) for run in value)
-            fits = value is None or listed
-            expected = 'None or a list of run folders such as ["../runs/a", "../runs/b"]'
-        elif key == "inspect":
-            fits, expected = isinstance(value, int | str), "the number of a query, or the name of one of its images"
-        elif default is None:
-            fits, expected = value is None or isinstance(value, str | Path), "None or the path of a folder as text"
-        elif type(default) is int:
-            fits, expected = type(value) is int and value >= 0, f"a whole number, 0 or more, such as {default}"
-        elif type(default) is float:
-            optional = key == "unit_m"  # None: unknown
-            fits = type(value) in (int, float) or (optional and value is None)
-            expected = f"{'None or ' if optional else ''}a number such as {default}"
-        else:
-            fits, expected = isinstance(value, type(default)), f"a {type(default).__name__} such as {default!r}"
-        if not fits:
-            raise ManifestError(f"{key}: found {value!r}, expected {expected}. It is a parameter of {path.name}.")
+    defaults = {key: value for key, value in notebook_parameters(path).items() if key not in checked and key in values}
+    fields: dict[str, Any] = {key: (_TYPES.get(key, _type_of(value)), ...) for key, value in defaults.items()}
+    model = create_model(path.stem, __config__=ConfigDict(strict=True), **fields)
+    try:
+        model.model_validate({key: values[key] for key in fields})
+    except ValidationError as error:
+        raise ManifestError(explain(error, model, path.name)) from None
+
+
+Pair = Annotated[Sequence[str], Field(min_length=2, max_length=2)]
+_TYPES: dict[str, Any] = {
+    "device": str | list[str],
+    "inspect": int | str,
+    "pairs": Sequence[Pair] | None,
+    "runs": Sequence[str | Path] | None,
+    "unit_m": float | None,
+}
+"""Types of parameters that are not those of their defaults."""
+
+
+def _type_of(default: Any) -> Any:
+    """Return the type of a parameter, by its default: a folder if that is None; numbers are not negative."""
+    return str | Path | None if default is None else NonNegativeInt if type(default) is int else type(default)
 
 
 def _literals(source: str) -> dict[str, Any]:
@@ -554,18 +494,12 @@ def execute(
     if kernels is None:
         with Kernels(output.parent) as own:
             return execute(path, output, parameters, progress, own)
-    memory, kernel = MemoryWatch(), kernels.take()
+    kernel, memory, partial = kernels.take(), MemoryWatch(), output.with_name(f".{output.stem}.partial.ipynb")
     # Imported here because that takes seconds, which a run that reuses everything does not need.
     import papermill
-    from jupyter_client.kernelspec import NoSuchKernel
-    from nbclient.exceptions import DeadKernelError
-    from nbformat.reader import NotJSONError
     from papermill.exceptions import PapermillExecutionError
 
-    partial = output.with_name(f".{output.stem}.partial.ipynb")
-    alive = False
     try:
-        kernel.started.result()
         notebook = papermill.execute_notebook(
             # papermill formats paths with the parameters, so braces in them need escaping.
             *(str(file).replace("{", "{{").replace("}", "}}") for file in (path, partial)),
@@ -574,26 +508,22 @@ def execute(
             progress_bar=False,
             stderr_file=progress,
             km=kernel.manager,
+            coalesce_streams=True,
         )
-        alive = True
     except PapermillExecutionError as error:
-        alive = True
         raise _cell_error(error, output) from None
-    except (DeadKernelError, RuntimeError, NoSuchKernel) as error:
+    except RuntimeError as error:  # also nbclient's `DeadKernelError`
         raise kernel_error(error, kernel.ended_by, memory.stop(), output) from error
     except KeyboardInterrupt:
         # Otherwise asyncio prints tracebacks for the tasks that are left behind.
         logging.getLogger("asyncio").setLevel(logging.CRITICAL)
         raise
     finally:
-        kernels.end(kernel, by_force=not alive)
+        kernels.end(kernel)
         memory.stop()
-        if partial.exists():
-            try:
-                _tidy_streams(partial)
-                partial.replace(output)
-            except NotJSONError:  # cut short by the error that is being raised, e.g. a full disk
-                partial.unlink()
+        if read_json(partial):
+            partial.replace(output)
+        partial.unlink(missing_ok=True)  # cut short by the error that is being raised, e.g. a full disk
     return notebook, memory.stop()
 
 
@@ -617,27 +547,6 @@ def _cell_error(error: "PapermillExecutionError", output: Path) -> StageError:
     if text := shortage(error.ename, error.evalue) or shortage("", "\n".join(re.findall(r"errno.*", trace, re.I))):
         return StageError(f"{text}{where}")
     return StageError(f"{errors.BUG}{error.ename}: {error.evalue}. This is a bug.{where}", internal=True)
-
-
-def _tidy_streams(path: Path) -> None:
-    """Join the pieces of each output stream of an executed notebook, and drop text that a carriage return overwrote."""
-    import nbformat
-
-    content = nbformat.read(path, as_version=4)
-    for cell in content.cells:
-        outputs: list[Any] = []
-        for output in cell.get("outputs", []):
-            if output.output_type == "stream" and outputs and outputs[-1].get("name") == output.name:
-                outputs[-1].text += output.text
-            else:
-                outputs.append(output)
-        for output in outputs:
-            if output.output_type == "stream":
-                lines = output.text.split("\n")
-                output.text = "\n".join(line.rstrip("\r").rpartition("\r")[2] for line in lines)
-        if "outputs" in cell:
-            cell.outputs = outputs
-    nbformat.write(content, path)
 
 
 def work_seconds(notebook: Any) -> float:

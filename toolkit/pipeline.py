@@ -9,9 +9,8 @@ import hashlib
 import json
 import logging
 import os
-import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -29,7 +28,6 @@ from toolkit.exchange.download import is_unfinished
 from toolkit.features.matching import local_weights, resolve_auto
 from toolkit.files import (
     SceneFiles,
-    any_unfinished,
     checksum,
     files_fingerprint,
     fingerprint,
@@ -37,7 +35,7 @@ from toolkit.files import (
     older_files,
     read_json,
     write_text,
-)  # fmt: skip
+)
 from toolkit.manifest import (
     STAGES,
     EmbedSettings,
@@ -55,22 +53,17 @@ from toolkit.notebook import (
     Say,
     StatusLine,
     check_names,
-    check_parameters,
     execute,
     handed_counts,
     notebook_parameters,
     notebook_path,
-    stage_folders,
-    stage_outputs,
     work_seconds,
 )
 from toolkit.prediction.architectures import ARCHITECTURES
 from toolkit.runs.cluster import open_cluster
-from toolkit.runs.folder import LOG, held, warnings_of_kernels
+from toolkit.runs.folder import LOG, OLDER, RunLog, failures, held, warnings_of_kernels
 from toolkit.runs.kernel import Kernels
-from toolkit.runs.pairs import pair_text, way_out
-from toolkit.runs.record import OLDER, Earlier, RunLog, failures
-from toolkit.runs.sweep import Shared, SweptRun, changed_keys, swept_runs, take_over, variant_name
+from toolkit.runs.sweep import changed_keys, swept_runs, take_over, variant_name
 from toolkit.sequences.pose_graph import require_gtsam
 
 log = logging.getLogger(__name__)
@@ -81,70 +74,45 @@ MOST_WARNINGS = 5
 
 @dataclass(frozen=True)
 class Job:
-    """One execution of one notebook, for one capture and perhaps only one device or pair of devices."""
+    """One execution of one notebook, for one capture."""
 
     stage: str
     files: SceneFiles
     settings: Settings
     parameters: dict[str, Any]
-    label: str = ""
-    """Part of the stage, if the stage takes several executions; part of the paths of its outputs."""
-
-    @property
-    def name(self) -> str:
-        return f"{self.files.scene} {self.label}".rstrip()
 
     @property
     def notebook(self) -> Path:
-        stem = f"{self.files.scene}_{notebook_path(self.stage).stem}"
-        return self.files.run / "notebooks" / f"{stem}{self.label and '_' + self.label}.ipynb"
+        return self.files.run / "notebooks" / f"{self.files.scene}_{notebook_path(self.stage).name}"
 
     @property
     def record(self) -> Path:
-        return self.files.root / ".stages" / f"{self.stage}{self.label and '_' + self.label}.json"
+        return self.files.root / ".stages" / f"{self.stage}.json"
 
-    @property
-    def pair(self) -> dict[str, str]:
-        """Map and query device if the job is for one pair; else empty."""
-        return {name: self.parameters[name] for name in ("map_device", "query_device") if self.label.startswith("map_")}
-
-    def makes(self, name: str) -> bool:
-        """Return whether this job writes a file, given by its path in the stage's folder of results."""
-        if self.stage == "embed":  # a folder per session, perhaps below one per model; only sessions have a _
-            return re.match(f"([^_/]+/)?{self.label}", name) is not None
-        pair = name.rpartition("/")[2].removeprefix(f"{self.files.scene}_")
-        if self.stage in ("localize", "sequence") and of_sequence(pair) != (self.stage == "sequence"):
-            return False
-        return not self.label or re.match(f"{self.label}(?![a-z0-9-])", pair) is not None
+    def made(self) -> list[Path]:
+        """Return the files that the stage has made."""
+        folder = self.files.of_stage(self.stage)
+        paths = [path for path in folder.rglob("*") if path.is_file()] if folder else []
+        if self.stage in ("localize", "sequence"):  # in one folder
+            paths = [path for path in paths if of_sequence(path.name) == (self.stage == "sequence")]
+        beside = {"retrieve": (self.files.index, "*_map*.faiss"), "localize": (self.files.maps, "*_map*.npz")}
+        folder, pattern = beside.get(self.stage, (None, ""))
+        return sorted([*paths, *(folder.glob(pattern) if folder else ())])
 
     def outputs(self) -> str:
-        """Return a fingerprint of the files that the job has made."""
-        folder = stage_outputs(self.files, self.stage)
-        results = tree_fingerprint(folder, self.makes, content=True) if folder else ""
-        beside = {"retrieve": (self.files.index, "faiss"), "localize": (self.files.maps, "npz")}
-        if self.stage not in beside:
-            return results
-        folder, suffix = beside[self.stage]
-        device = self.parameters.get("map_device", "all")
-        maps = sorted(folder.glob(f"{'*' if device == 'all' else device}_map*.{suffix}"))
-        return fingerprint([results, [[path.name, checksum(path)] for path in maps]])
+        """Return a fingerprint of the files that the stage has made; empty if one of them is unfinished."""
+        made = self.made()
+        if any(path.name.endswith(".meta.json") and read_json(path).get("unfinished") for path in made):
+            return ""
+        return fingerprint([[path.relative_to(self.files.root), checksum(path)] for path in made])
 
-    def older(self) -> str:
-        """Return why the results are older than what they were made from; empty if they are not."""
-        folder = stage_outputs(self.files, self.stage)
-        older = older_files(folder, self.stage, self.makes) if folder else {}
-        return next(iter(older.values()), "")
-
-    def forget(self) -> None:
-        """Remove the fingerprints beside the outputs of a stage without `skip_existing`, so that it reuses none.
-
-        The other stages discard their results themselves; without their records, these would look torn.
-        """
-        folder = stage_outputs(self.files, self.stage)
-        if folder and "skip_existing" not in self.parameters:
-            for path in folder.rglob("*.meta.json"):
-                if self.makes(path.relative_to(folder).as_posix()):
-                    path.unlink()
+    def earlier_row(self) -> dict[str, Any] | None:
+        """Return the row of the last execution, for a run that leaves the stage out; None without one."""
+        row = read_json(self.record).get("row")
+        folder = self.files.of_stage(self.stage)
+        older = older_files(folder, self.stage) if row and folder else {}
+        status = {"status": OLDER, "reason": next(iter(older.values()))} if older else {"status": "reused"}
+        return {**row, **status} if row else None
 
 
 def run(
@@ -156,6 +124,7 @@ def run(
     cluster: str | None = None,
     name: str | None = None,
     in_place: bool = False,
+    donors: Sequence[Path] = (),
 ) -> Path:
     """Run a manifest and return its run folder, with `run.json` and `report.html` in it.
 
@@ -172,6 +141,7 @@ def run(
         cluster: cluster whose workers the stages use, see `runs.cluster.open_cluster`.
         name: name of the run folder; None: as above.
         in_place: write into the folder of the manifest, whatever the overrides are.
+        donors: folders of further runs to take results from.
 
     Raises:
         ManifestError: the manifest or an argument is wrong; nothing has run.
@@ -181,69 +151,57 @@ def run(
         raise ManifestError("--in-place and --name exclude each other: give one of them.")
     overrides = list(overrides)
     manifest = load_manifest(manifest_path, overrides)
-    _check_only(only, manifest, manifest_path)
-    if not in_place:
-        name, shared = own_run(manifest_path, manifest, overrides, name)
-        if name != manifest.name or shared:
-            manifest = _own_manifest(manifest, name, shared, shared.run if shared else name)
-            say(f"Run folder: {Path(manifest.output_root) / name}")
-    return _run_in(manifest, manifest_path, only, force, say, cluster)
+    _check(manifest, manifest_path, only)
+    plain, own = run_name(manifest_path, manifest, overrides, name)
+    manifest, root = _name_embedder(manifest, say), Path(manifest.output_root)
+    if not in_place and {own} != {plain.name, manifest.name}:
+        if manifest.demo_data and manifest.demo_data == plain.demo_data:  # rendered once for all runs of a manifest
+            captures = _captures(manifest.model_copy(update={"name": plain.name}))
+            manifest = manifest.model_copy(update={"demo_data": None, "captures": list(map(str, captures))})
+        manifest = manifest.model_copy(update={"name": own})
+        take_over([root / plain.name, *donors], manifest)
+        say(f"Run folder: {root / own}")
+    devices = [device.model_dump(exclude_none=True) for device in manifest.extra_devices]
+    with extra_devices(devices), allow_outside(manifest.allow_outside):
+        return _run(manifest, only, force, say, cluster)
 
 
-def _check_only(only: str | None, manifest: Manifest, manifest_path: str | Path) -> None:
-    """Raise ManifestError for a stage to run alone that does not exist or is off."""
-    if only is not None and only not in STAGES:
-        raise ManifestError(f"--only {only}: no such stage. {nearest(only, STAGES)}")
-    if only is not None and only not in manifest.stages:
-        raise ManifestError(f"--only {only}: {manifest_path} has no section `{only}`, so the stage is off.")
-
-
-def own_run(
+def run_name(
     manifest_path: str | Path, manifest: Manifest, overrides: Sequence[str], name: str | None = None
-) -> tuple[str, Shared | None]:
-    """Return the name of the run of a manifest with overrides, and what it shares with the run without them.
+) -> tuple[Manifest, str]:
+    """Return a manifest without its overrides, and the name of the run with them.
 
     Args:
         manifest: content of `manifest_path`, with the overrides.
         name: chosen by the user; None: named after the overrides that change a result.
-
-    Returns:
-        The name; and what it shares, None if it is the manifest's own run or there can be none.
     """
     try:
         plain = load_manifest(manifest_path)
     except ManifestError:  # it needs the overrides, so there is no run without them
-        return name or manifest.name, None
-    keys = changed_keys(plain, manifest, overrides)
-    if name is None:
-        chosen = any(override.partition("=")[0].strip() == "name" for override in overrides)
-        name = manifest.name if chosen else variant_name(plain.name, keys)
-    return name, Shared(plain.name, list(keys)) if name != plain.name else None
+        return manifest, name or manifest.name
+    if any(override.partition("=")[0].strip() == "name" for override in overrides):
+        return plain, name or manifest.name
+    return plain, name or variant_name(plain.name, changed_keys(plain, manifest, overrides))
 
 
-def _own_manifest(manifest: Manifest, name: str, shared: Shared | None, plain: str) -> Manifest:
-    """Return the manifest of a run of its own, and fill its folder with what it shares with another run.
-
-    Args:
-        plain: name of the manifest without overrides, whose rendered capture all its runs use.
-    """
-    own = manifest.model_copy(update={"name": name})
-    if shared is None or {key.partition(".")[0] for key in shared.differing} & {"captures", "demo_data"}:
-        return own
-    if manifest.demo_data:
-        captures = _captures(manifest.model_copy(update={"name": plain}))
-        own = own.model_copy(update={"demo_data": None, "captures": list(map(str, captures))})
-    root = Path(own.output_root)
-    take_over(root / shared.run, root / name, [Path(capture).name for capture in own.captures], shared.differing)
-    return own
-
-
-def _run_in(
-    manifest: Manifest, manifest_path: str | Path, only: str | None, force: bool, say: Say, cluster: str | None
-) -> Path:
-    devices = [device.model_dump(exclude_none=True) for device in manifest.extra_devices]
-    with extra_devices(devices), allow_outside(manifest.allow_outside):
-        return _run(manifest, manifest_path, only, force, say, cluster)
+def _check(manifest: Manifest, manifest_path: str | Path, only: str | None) -> None:
+    """Raise ManifestError for what can be seen to fail before anything runs."""
+    if only is not None and only not in STAGES:
+        raise ManifestError(f"--only {only}: no such stage. {nearest(only, STAGES)}")
+    if only is not None and only not in manifest.stages:
+        raise ManifestError(f"--only {only}: {manifest_path} has no section `{only}`, so the stage is off.")
+    fetch = f"python -m toolkit download {manifest_path}"
+    for capture in map(Path, manifest.captures):
+        if is_unfinished(capture):
+            raise ManifestError(f"{capture}: its download is not complete. Continue it first: {fetch}")
+        if manifest.dataset and capture.name in manifest.dataset.sources and not (capture / "sessions").is_dir():
+            text = f"{capture}: no such capture. Download it first: {fetch}"
+            raise ManifestError(f"{text}\nIf you already have it, name its folder in `captures`.")
+    for stage in STAGES:
+        try:
+            check_names(manifest.stage(stage))
+        except ManifestError as error:
+            raise ManifestError(f"{manifest_path}: {stage}: {error}") from None
 
 
 def sweep(
@@ -257,9 +215,9 @@ def sweep(
 ) -> tuple[list[Path], list[ToolkitError]]:
     """Run a manifest once per swept value, in folders `<output_root>/<name>-<key>-<value>`.
 
-    Each run takes over, from the earlier run with the most values in common, the results that the differing keys do not
-    change, even if that run failed. The first run takes them from the plain run of the manifest, if there is one. A
-    demo capture is rendered once for all runs. If a run fails, the next ones still run.
+    Each run takes over what does not depend on the differing settings, from the run that shares most with it: that of
+    the manifest itself or an earlier one of the sweep, even if it failed. A demo capture is rendered once for all runs.
+    If a run fails, the next ones still run.
 
     Args:
         sweeps: `key=a,b,c` each, see `runs.sweep.swept_runs`; several keys give all combinations of their values.
@@ -271,44 +229,31 @@ def sweep(
     Raises:
         ManifestError: the manifest or a swept value is wrong; nothing has run.
     """
-    name, shared = own_run(manifest_path, load_manifest(manifest_path, overrides), overrides)
-    plain = shared or Shared(name, [])
-    runs = {one: load_manifest(manifest_path, [*overrides, *one.overrides]) for one in swept_runs(name, sweeps)}
-    for manifest in runs.values():  # find mistakes before hours of work
-        _check_only(only, manifest, manifest_path)
-        _check_stages(manifest, manifest_path)
-    done, failed = dict[SweptRun, Path](), dict[SweptRun, ToolkitError]()
-    for number, (one, manifest) in enumerate(runs.items(), 1):
-        say(f"{one.name} ({number} of {len(runs)}): {', '.join(one.overrides)}")
-        # The run that differs in the fewest keys has most results to share; among equals, prefer one that succeeded.
-        donor = max(
-            [*done, *failed],
-            key=lambda other: (len({*other.overrides} & {*one.overrides}), other in done),
-            default=SweptRun(plain.run, ()),
-        )
-        keys = [override.partition("=")[0] for override in one.overrides if override not in donor.overrides]
-        differing = [*keys, *(plain.differing if donor.name == plain.run else ())]
+    manifest = load_manifest(manifest_path, overrides)
+    name = run_name(manifest_path, manifest, overrides)[1]
+    runs = swept_runs(name, sweeps)
+    for swept in runs.values():  # find mistakes before hours of work
+        _check(load_manifest(manifest_path, [*overrides, *swept]), manifest_path, only)
+    folders = [Path(manifest.output_root) / one for one in (name, *runs)]
+    done, failed = list[Path](), list[ToolkitError]()
+    for number, (name, swept) in enumerate(runs.items(), 1):
+        say(f"{name} ({number} of {len(runs)}): {', '.join(swept)}")
+        settings = [*overrides, *swept]
         try:
-            own = _own_manifest(manifest, one.name, Shared(donor.name, differing), plain.run)
-            done[one] = _run_in(own, manifest_path, only, force, say, cluster)
+            done.append(run(manifest_path, only, force, settings, say, cluster, name, donors=folders[:number]))
         except ToolkitError as error:
-            say(f"{one.name}: {sentence(error)}")
-            failed[one] = error
-    return list(done.values()), list(failed.values())
+            say(f"{name}: {sentence(error)}")
+            failed.append(error)
+    return done, failed
 
 
-def _run(
-    manifest: Manifest, manifest_path: str | Path, only: str | None, force: bool, say: Say, cluster: str | None
-) -> Path:
-    _require_downloads(manifest, manifest_path)
-    _check_stages(manifest, manifest_path)
-    manifest = _name_embedder(manifest, say)
+def _run(manifest: Manifest, only: str | None, force: bool, say: Say, cluster: str | None) -> Path:
     run_dir = Path(manifest.output_root) / manifest.name
     stages = [only] if only else [stage for stage in STAGES if stage in manifest.stages]
     if "sequence" in stages:
         require_gtsam()
     for stage in stages:
-        if not any(run_dir.glob(f"*/.stages/{stage}*.json")):
+        if not any(run_dir.glob(f"*/.stages/{stage}.json")):
             _require_weights(stage, manifest.stage(stage))
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
@@ -326,26 +271,12 @@ def _run(
     return run_dir
 
 
-def _check_stages(manifest: Manifest, manifest_path: str | Path) -> None:
-    """Raise ManifestError for settings that a stage or its notebook does not know."""
-    for stage in STAGES:
-        path, settings = notebook_path(stage), manifest.stage(stage)
-        parameters = settings_parameters(settings, notebook_parameters(path))
-        check_parameters(path, parameters, f"{manifest_path}: {stage}.")
-        try:
-            check_names(settings)
-        except ManifestError as error:
-            raise ManifestError(f"{manifest_path}: {stage}: {error}") from None
-
-
 def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: bool, say: Say, kernels: Kernels) -> None:
-    captures = _captures(manifest, kernels)
+    captures = _captures(manifest)
+    of_manifest = [stage for stage in STAGES if stage in manifest.stages]
     every = [
-        job
-        for capture in captures
-        for stage in STAGES
-        if stage in manifest.stages
-        for job in _jobs(manifest, stage, capture, SceneFiles(run_dir, capture.name), force)
+        _job(manifest, stage, capture, SceneFiles(run_dir, capture.name), force)
+        for capture, stage in product(captures, of_manifest)
     ]
     jobs = [job for job in every if job.stage in stages]
     inputs = {capture.name: tree_fingerprint(capture / "sessions") for capture in captures}
@@ -355,27 +286,43 @@ def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: boo
             force or not _reusable(job, _inputs_of(job, inputs[job.files.scene]))
         ):
             _require_weights(job.stage, job.settings)
-    earlier = [Earlier(job.record, job.older) for job in every if job.stage not in stages]
-    record = RunLog(run_dir, manifest, inputs, _code_fingerprint(), earlier)
+    left = [job for job in every if job.stage not in stages]
+    record = RunLog(
+        run_dir, manifest, inputs, _code_fingerprint(), lambda: [row for job in left if (row := job.earlier_row())]
+    )
+    failed: list[tuple[Job, StageError]] = []
+    lost = set[tuple[str, str]]()
     try:
         record.write()
-        failed: list[tuple[Job, StageError]] = []
         for i, job in enumerate(jobs, 1):
             kernels.left = len(jobs) - i + 1
-            head = f"[{i}/{len(jobs)}] {job.stage:<9} {job.name}"
-            try:
-                _run_or_reuse(job, inputs[job.files.scene], failed, force, head, record, say, kernels)
-            except StageError as error:
-                if not error.of_the_data:
-                    raise
-                failed.append((job, error))  # other captures and pairs may succeed
+            head = f"[{i}/{len(jobs)}] {job.stage:<9} {job.files.scene}"
+            scene, job_inputs = job.files.scene, _inputs_of(job, inputs[job.files.scene])
+            if cause := next((stage for stage in UPSTREAM[job.stage] if (scene, stage) in lost), None):
+                message = f"skipped: {cause} has failed"
+                row = {"stage": job.stage, "scene": scene, "status": "skipped", "error": message}
+                lost.add((scene, job.stage))
+            elif not force and (reusable := _reusable(job, job_inputs)):
+                row, message = reusable, "reused"
+            else:
+                try:
+                    record.add(_run_job(job, job_inputs, head, record, say, kernels))
+                except StageError as error:
+                    if not error.of_the_data:
+                        raise
+                    failed.append((job, error))  # other captures may succeed
+                    lost.add((scene, job.stage))
+                continue
+            say(f"{head}  {message}")
+            log.info("%s  %s", head, message)
+            record.add(row)
         for row in record.all_rows():
             if row["status"] == OLDER:
                 say(f"{row['stage']} {row['scene']} was not run again: {row['reason']}")
         last = [row["status"] for row in record.rows if row["stage"] == stages[-1]]
         if failed and not {"done", "reused"} & set(last):
             raise failed[0][1]
-        record.end(incomplete=_not_tolerated(manifest, failed, record, _devices(manifest, captures)))
+        record.end(incomplete=_not_tolerated(manifest, failed, record))
         _write_report(run_dir)
     except BaseException as error:
         record.end(error)
@@ -388,88 +335,37 @@ def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: boo
         raise
 
 
-def _run_or_reuse(
-    job: Job,
-    capture: str,
-    failed: list[tuple[Job, StageError]],
-    force: bool,
-    head: str,
-    record: RunLog,
-    say: Say,
-    kernels: Kernels,
-) -> None:
-    """Execute a job, reuse its results, or skip it, and add its row to the record."""
-    inputs = _inputs_of(job, capture)
-    if cause := next((other for other, _ in failed if _builds_on(job, other)), None):
-        message = f"skipped: {cause.stage} has failed"
-        row = {"stage": job.stage, "scene": job.files.scene, "part": job.label, "status": "skipped", "error": message}
-    elif not force and (reusable := _reusable(job, inputs)):
-        row, message = reusable, "reused"
-    else:
-        row, message = _run_job(job, inputs, force, head, record, say, kernels), ""
-    if message:
-        say(f"{head}  {message}")
-        log.info("%s  %s", head, message)
-    record.add(row)
-
-
-def _builds_on(job: Job, other: Job) -> bool:
-    """Return whether a job needs the results of another job."""
-    upstream = set(UPSTREAM[job.stage])
-    for stage in reversed(STAGES):
-        upstream |= set(UPSTREAM[stage]) if stage in upstream else set()
-    return job.files == other.files and other.stage in upstream and other.label in ("", job.label)
-
-
-def _devices(manifest: Manifest, captures: list[Path]) -> list[str]:
-    """Return the devices of the captures that the manifest includes."""
-    from toolkit.capture import Capture
-
-    present = dict.fromkeys(device for capture in captures for device in Capture.open(capture).devices)
-    return [device for device in present if manifest.devices == "auto" or device in manifest.devices]
-
-
-def _not_tolerated(
-    manifest: Manifest, failed: list[tuple[Job, StageError]], record: RunLog, devices: list[str]
-) -> str | None:
+def _not_tolerated(manifest: Manifest, failed: list[tuple[Job, StageError]], record: RunLog) -> str | None:
     """Return a description of the failures that exceed the manifest's `tolerate_failed`; None if there are none."""
-    lines = [f"{job.stage} {job.name}: {error}" for job, error in failed if not job.label]
+    lines = [f"{job.stage} {job.files.scene}: {error}" for job, error in failed]
     rows = record.all_rows()
     for kind, counts in failures(rows).items():
         tolerated = getattr(manifest.tolerate_failed, kind)
         if counts["of"] and counts["failed"] / counts["of"] > tolerated:  # a product would be rounded below the count
-            lines.append(
-                f"{counts['failed']} of {counts['of']} {kind} failed; tolerate_failed.{kind} is {tolerated:g}."
-            )
+            found = f"{counts['failed']} of {counts['of']} {kind} failed"
+            lines.append(f"{found}; tolerate_failed.{kind} is {tolerated:g}.")
     if not lines:
         return None
-    lost = [one | {"scene": row["scene"]} for row in rows for one in row.get("left_out", ())]
     whats: dict[str, list[str]] = {}
-    for one in lost:
-        whats.setdefault(one["reason"], []).append(f"{one['what']} of {one['scene']}")
-    reasons = [f"{', '.join(dict.fromkeys(names))}: {reason}" for reason, names in whats.items()]
-    pairs = [(one["map_device"], one["query_device"]) for one in lost if "map_device" in one]
-    advice = [way_out(pairs, devices)] if pairs else []
-    return "\n".join([*lines, *reasons, *advice])
+    for row in rows:
+        for one in row.get("left_out", ()):
+            whats.setdefault(one["reason"], []).append(f"{one['what']} of {row['scene']}")
+    if whats:
+        lines += [f"{', '.join(dict.fromkeys(names))}: {reason}" for reason, names in whats.items()]
+        lines.append("Repair the data, or exclude what failed with `devices:` or `pairs:` in the manifest.")
+    return "\n".join(lines)
 
 
-def tree_fingerprint(folder: Path, of: Callable[[str], bool] | None = None, content: bool = False) -> str:
-    """Return a fingerprint, 16 hex digits, of the files below a folder; links are followed.
-
-    Args:
-        of: selects files by their path below the folder; None: all files.
-        content: hash the content of each file beside its path and size, instead of the time of its last change. This
-            also detects damage, and takes about a second for some gigabytes that are in the page cache.
-    """
+def tree_fingerprint(folder: Path) -> str:
+    """Return a fingerprint, 16 hex digits, of the files below a folder by size and time; links are followed."""
     rows = []
     for root, folders, names in os.walk(folder, followlinks=True):
         folders.sort()
         parent = os.path.relpath(root, folder)
         for name in sorted(names):
-            if of is None or of(f"{parent}/{name}"):
-                with suppress(FileNotFoundError):
-                    stat = os.stat(file := f"{root}/{name}")  # noqa: PTH116 - a Path for each is 5 times slower
-                    rows.append([parent, name, stat.st_size, checksum(file) if content else stat.st_mtime_ns])
+            with suppress(FileNotFoundError):
+                stat = os.stat(f"{root}/{name}")  # noqa: PTH116 - a Path for each is 5 times slower
+                rows.append([parent, name, stat.st_size, stat.st_mtime_ns])
     return fingerprint(rows)
 
 
@@ -495,97 +391,69 @@ def _weights_needed(stage: str, settings: Settings) -> list[tuple[WeightsSource,
     needed: list[tuple[WeightsSource, str | None]] = []
     if isinstance(settings, LocalizeSettings):
         if settings.method == "nearest":
-            return []
+            return needed
         if settings.predicts and (network := ARCHITECTURES.get(settings.predictor.name)):
             needed.append((network.weights, settings.predictor.checkpoint))
         local = local_weights(resolve_auto(settings))
     elif isinstance(settings, RerankSettings):
         local = local_weights(resolve_auto(settings))
     else:
-        return []
+        return needed
     for source, checkpoint in local:
         section = source.setting.removeprefix("localize.")
         needed.append((replace(source, setting=f"{stage}.{section}"), checkpoint))
     return needed
 
 
-def _captures(manifest: Manifest, kernels: Kernels | None = None) -> list[Path]:
-    """Return the folders of the captures; render that of `demo_data`, while a kernel starts."""
-    if manifest.demo_data is not None:
-        from toolkit.synthetic import render_capture
+def _captures(manifest: Manifest) -> list[Path]:
+    """Return the folders of the captures; render that of `demo_data`."""
+    if manifest.demo_data is None:
+        return [Path(capture) for capture in manifest.captures]
+    from toolkit.synthetic import render_capture
 
-        folder = Path(manifest.output_root).parent / "data" / manifest.name
-        if kernels is not None and not folder.exists():
-            kernels.prepare()
-        return [render_capture(folder, **manifest.demo_data.model_dump())]
-    return [Path(capture) for capture in manifest.captures]
+    folder = Path(manifest.output_root).parent / "data" / manifest.name
+    return [render_capture(folder, **manifest.demo_data.model_dump())]
 
 
-def _require_downloads(manifest: Manifest, manifest_path: str | Path) -> None:
-    """Raise ManifestError if a capture has yet to be downloaded, or its download has not finished."""
-    fetch = f"python -m toolkit download {manifest_path}"
-    for capture in map(Path, manifest.captures):
-        if is_unfinished(capture):
-            raise ManifestError(f"{capture}: its download is not complete. Continue it first: {fetch}")
-        if manifest.dataset and capture.name in manifest.dataset.sources and not (capture / "sessions").is_dir():
-            raise ManifestError(
-                f"{capture}: no such capture. Download it first: {fetch}\n"
-                "If you already have it, name its folder in `captures`."
-            )
-
-
-def _jobs(manifest: Manifest, stage: str, capture: Path, files: SceneFiles, force: bool) -> Iterator[Job]:
-    """Yield the jobs of a stage: one, or several if the manifest selects only some devices or pairs."""
+def _job(manifest: Manifest, stage: str, capture: Path, files: SceneFiles, force: bool) -> Job:
+    """Return the job of a stage: the folders and pairs that its notebook has parameters for, and all its settings."""
     values: dict[str, Any] = {
-        **stage_folders(files),
-        "sessions_root": capture / "sessions",
-        "out_dir": stage_outputs(files, stage),
+        **{name: str(folder) for name, folder in files.folders(stage).items()},
+        "sessions_root": str(capture / "sessions"),
         "queries": manifest.queries,
+        **_selection(manifest, capture),
     }
     if manifest.rerank is not None:
         reranked = {"localize": "retrieval_dir", "evaluate": "reranked_dir"}
-        values |= {name: files.reranked_dir for of, name in reranked.items() if of == stage}
+        values |= {name: str(files.reranked_dir) for of, name in reranked.items() if of == stage}
     if force:
         values["skip_existing"] = False
+    settings = manifest.stage(stage)
+    if given := settings.given():
+        values["settings"] = given
     known = notebook_parameters(notebook_path(stage))
-    for label, choice in _parts(manifest, stage, capture):
-        parameters = {name: value for name, value in (values | choice).items() if name in known}
-        plain = {name: str(value) if isinstance(value, Path) else value for name, value in parameters.items()}
-        settings = manifest.stage(stage)
-        yield Job(stage, files, settings, plain | settings_parameters(settings, known), label)
+    return Job(stage, files, settings, {name: value for name, value in values.items() if name in known})
 
 
-def settings_parameters(settings: Settings, known: Iterable[str]) -> dict[str, Any]:
-    """Return settings that were set as notebook parameters: those in its parameters cell, and a dict of the rest."""
-    given = settings.given()
-    rest = {key: value for key, value in given.items() if key not in known}
-    return {key: value for key, value in given.items() if key in known} | ({"settings": rest} if rest else {})
-
-
-def _parts(manifest: Manifest, stage: str, capture: Path) -> list[tuple[str, dict[str, Any]]]:
-    """Return (label, parameters that select devices) for each job of a stage."""
+def _selection(manifest: Manifest, capture: Path) -> dict[str, Any]:
+    """Return the parameters that select `pairs` and `devices` of a capture as the manifest does; {}: all of them."""
     from toolkit.capture import Capture
 
     content = Capture.open(capture)
     present = content.devices
-    # Without any map or query session, the stages say what is missing.
-    maps, queries = ([d for d in present if f"{d}_{split}" in content] or present for split in ("map", "query"))
-    every = list(product(maps, queries))
-    devices = present if manifest.devices == "auto" else manifest.devices
-    wanted = every if manifest.pairs == "all" else dict.fromkeys((m, q) for m, q in manifest.pairs)
-    pairs = [(m, q) for m, q in wanted if {m, q} <= {*devices} & {*present}]
+    devices = present if manifest.devices == "auto" else [key for key in present if key in manifest.devices]
+    if manifest.pairs != "all":
+        pairs = [list(pair) for pair in manifest.pairs if {*pair} <= {*devices}]
+    elif manifest.devices != "auto":
+        # Without any map or query session, the stages say what is missing.
+        maps, queries = ([d for d in present if f"{d}_{split}" in content] or present for split in ("map", "query"))
+        pairs = [[m, q] for m, q in product(maps, queries) if {m, q} <= {*devices}]
+    else:
+        return {}
     if not pairs:
-        raise ManifestError(
-            f"{capture}: `devices` and `pairs` of the manifest select none of its maps with queries. "
-            f"Its sessions: {', '.join(content)}."
-        )
-    if set(pairs) == set(every):
-        return [("", {"device": "auto", "map_device": "all", "query_device": "all"})]
-    if stage == "embed":
-        return [(f"{d}_", {"device": d}) for d in present if any(d in pair for pair in pairs)]
-    if stage in ("retrieve", "rerank", "localize", "sequence"):
-        return [(f"map_{m}_query_{q}", {"map_device": m, "query_device": q}) for m, q in pairs]
-    return [("", {"map_device": "all", "query_device": "all", "pairs": [list(pair) for pair in pairs]})]
+        text = f"{capture}: `devices` and `pairs` of the manifest select none of its maps with queries."
+        raise ManifestError(f"{text} Its sessions: {', '.join(content)}.")
+    return {"pairs": pairs, "device": [key for key in present if any(key in pair for pair in pairs)]}
 
 
 def _inputs_of(job: Job, capture: str) -> str:
@@ -593,11 +461,7 @@ def _inputs_of(job: Job, capture: str) -> str:
     # `skip_existing` does not change the results.
     parameters = {name: value for name, value in job.parameters.items() if name != "skip_existing"}
     source = hashlib.sha256(notebook_path(job.stage).read_bytes()).hexdigest()
-    upstream = [
-        read_json(record).get("made")
-        for stage in UPSTREAM[job.stage]
-        for record in sorted(job.record.parent.glob(f"{stage}*.json"))
-    ]
+    upstream = [read_json(job.record.with_name(f"{stage}.json")).get("made") for stage in UPSTREAM[job.stage]]
     return fingerprint([parameters, table_record(), _files_of(job), capture, _code_fingerprint(), source, upstream])
 
 
@@ -620,24 +484,21 @@ def _code_fingerprint() -> str:
 def _reusable(job: Job, inputs: str) -> dict[str, Any] | None:
     """Return the row of an earlier execution if its inputs, outputs and notebook are still the same; else None."""
     record = read_json(job.record)
-    if record.get("inputs") != inputs or record.get("outputs") != job.outputs() or not read_json(job.notebook):
+    if record.get("inputs") != inputs or not read_json(job.notebook):
+        return None
+    if record.get("outputs") != (job.outputs() or None):
         return None
     # Left-out pairs are tried again: a repair, such as a changed permission, may not show in a fingerprint.
     return None if record["row"].get("left_out") else {**record["row"], "status": "reused"}
 
 
-def _run_job(
-    job: Job, inputs: str, force: bool, head: str, record: RunLog, say: Say, kernels: Kernels
-) -> dict[str, Any]:
+def _run_job(job: Job, inputs: str, head: str, record: RunLog, say: Say, kernels: Kernels) -> dict[str, Any]:
     """Execute a job and return its row of `run.json`."""
     line = StatusLine(head, say)
-    row: dict[str, Any] = {"stage": job.stage, "scene": job.files.scene, "part": job.label}
+    row: dict[str, Any] = {"stage": job.stage, "scene": job.files.scene}
     row |= {"notebook": str(job.notebook.relative_to(job.files.run)), "parameters": job.parameters}
-    row |= {"asked": 1} if job.pair else {}
     # There is no record while the stage runs, so a killed stage runs again.
     job.record.unlink(missing_ok=True)
-    if force:
-        job.forget()
     started, logged = time.perf_counter(), (job.files.run / LOG).stat().st_size
     try:
         notebook, memory = execute(notebook_path(job.stage), job.notebook, job.parameters, line, kernels)
@@ -645,8 +506,6 @@ def _run_job(
         status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
         line.end(status)
         row |= {"status": status, "seconds": round(time.perf_counter() - started, 2), "error": sentence(error)}
-        if job.pair:
-            row["left_out"] = [job.pair | {"what": pair_text(job.pair), "reason": sentence(error)}]
         with suppress(OSError):  # the disk itself may be the cause
             record.add(row)
         raise
@@ -657,10 +516,7 @@ def _run_job(
     row |= {name: counts.pop(name) for name in ("left_out", "asked") if name in counts}
     row |= {"status": "done", "seconds": round(seconds, 2), "startup_seconds": round(seconds - work, 2)}
     row |= {"work_seconds": round(work, 2), "peak_memory_mb": round(memory), "counts": counts}
-    folder = stage_outputs(job.files, job.stage)
-    # With unfinished outputs, an empty fingerprint makes the next run execute the stage again.
-    outputs = "" if folder and any_unfinished(folder, job.makes) else job.outputs()
-    made = {"made": datetime.now(UTC).isoformat(), "inputs": inputs, "outputs": outputs, "row": row}
+    made = {"made": datetime.now(UTC).isoformat(), "inputs": inputs, "outputs": job.outputs(), "row": row}
     write_text(job.record, json.dumps(made, indent=1) + "\n")
     summary = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in counts.items())
     line.end(f"{summary}{summary and '; '}{work:.1f} s + {seconds - work:.1f} s start-up, {memory:.0f} MB")

@@ -10,7 +10,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +54,7 @@ def rerank_pairs(
     *,
     map_device: str = "all",
     query_device: str = "all",
+    pairs: Sequence[Sequence[str]] | None = None,
     skip_existing: bool = True,
     workers: int = 0,
 ) -> pd.DataFrame:
@@ -73,6 +73,7 @@ def rerank_pairs(
         out_dir: folder of the reranked files.
         settings: see `RerankSettings`; a dict needs only the values that differ from the defaults.
         map_device, query_device: `ios`, `hl`, `spot`, or `all` devices of the capture.
+        pairs: only these [map device, query device]; None: all of the chosen devices.
         skip_existing: reuse files made from the same inputs and settings, and continue a killed run.
         workers: threads; 0: one per core.
 
@@ -93,7 +94,7 @@ def rerank_pairs(
     workers = workers or default_workers()
     table = PairRows(capture.name, Path(out_dir), Path(retrieval_dir))
     with one_thread():  # queries are the parallel dimension
-        for devices in product(capture.devices_with("map", map_device), capture.devices_with("query", query_device)):
+        for devices in capture.pairs(map_device, query_device, pairs):
             with table.row(*devices) as row:
                 table.check_upstream()
                 started = time.perf_counter()

@@ -3,7 +3,7 @@
 import json
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
@@ -54,6 +54,7 @@ def retrieve_pairs(
     *,
     map_device: str = "all",
     query_device: str = "all",
+    pairs: Sequence[Sequence[str]] | None = None,
     queries: str = "keyframes_pruned_subsampled",
     skip_existing: bool = True,
 ) -> pd.DataFrame:
@@ -65,6 +66,7 @@ def retrieve_pairs(
         out_jsonl: a folder, or for one pair a file `*.jsonl`; None: `<map_feats_root>/../retrieval`.
         settings: see `RetrieveSettings`; a dict needs only the values that differ from the defaults.
         map_device, query_device: `ios`, `hl`, `spot`, or `all` devices of the capture.
+        pairs: only these [map device, query device]; None: all of the chosen devices.
         queries: name of the keyframe list whose keyframes are the queries, or `all`.
         skip_existing: reuse files made from the same embeddings, poses and settings.
 
@@ -81,13 +83,11 @@ def retrieve_pairs(
     """
     settings = RetrieveSettings.of(settings)
     capture = Capture.from_sessions_root(sessions_root)
-    map_devices = capture.devices_with("map", map_device)
-    query_devices = capture.devices_with("query", query_device)
+    chosen = capture.pairs(map_device, query_device, pairs)
     embeddings = Path(map_feats_root)
     out = Path(out_jsonl) if out_jsonl is not None else embeddings.parent / "retrieval"
-    pairs = len(map_devices) * len(query_devices)
-    if out.suffix == ".jsonl" and pairs != 1:
-        raise ManifestError(f"out_jsonl is one file ({out}) for {pairs} pairs; give a folder.")
+    if out.suffix == ".jsonl" and len(chosen) != 1:
+        raise ManifestError(f"out_jsonl is one file ({out}) for {len(chosen)} pairs; give a folder.")
     folder = out.parent if out.suffix == ".jsonl" else out
     table = PairRows(capture.name, folder)
     poses = _rough_poses(settings.mask)
@@ -100,9 +100,9 @@ def retrieve_pairs(
     def load_database(device: str) -> _Images:
         return _load_database(capture[f"{device}_map"], embeddings, settings.normalize)
 
-    for map_device in map_devices:
+    for map_device in dict.fromkeys(of_map for of_map, _ in chosen):
         todo: dict[str, tuple[_Images, Path, dict[str, Any]]] = {}
-        for device in query_devices:
+        for device in (query for of_map, query in chosen if of_map == map_device):
             with table.row(map_device, device) as row:
                 query, database = load_queries(device), load_database(map_device)
                 path = out if out.suffix == ".jsonl" else out / f"{pair_name(capture.name, map_device, device)}.jsonl"

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +82,7 @@ def sequence_pairs(
     *,
     map_device: str = "all",
     query_device: str = "all",
+    pairs: Sequence[Sequence[str]] | None = None,
     skip_existing: bool = True,
 ) -> pd.DataFrame:
     """Write the poses of all frames of the queries' recordings, and a table of them, for each pair of devices.
@@ -97,6 +97,7 @@ def sequence_pairs(
         poses_dir: RUN/SCENE/poses, the folder of the localize stage's poses; the results go there, too.
         settings: see `SequenceSettings`; a dict holds values that differ from the defaults.
         map_device, query_device: `ios`, `hl`, `spot`, or `all` devices of the capture.
+        pairs: only these [map device, query device]; None: all of the chosen devices.
         skip_existing: reuse results that were made from the same inputs and settings.
 
     Returns:
@@ -111,7 +112,7 @@ def sequence_pairs(
     settings = SequenceSettings.of(settings)
     capture = Capture.from_sessions_root(sessions_root)
     rows = []
-    for devices in product(capture.devices_with("map", map_device), capture.devices_with("query", query_device)):
+    for devices in capture.pairs(map_device, query_device, pairs):
         row = {"map_device": devices[0], "query_device": devices[1], **dict.fromkeys(_COUNTS, 0)}
         row |= {"seconds": 0.0, "skipped": False, "path": "", "reason": ""}
         try:

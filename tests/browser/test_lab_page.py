@@ -8,12 +8,12 @@ import pytest
 
 from docs import chromium
 from toolkit.notebook import NOTEBOOKS
-from toolkit.runs.lab import WIDGET
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
 pytestmark = pytest.mark.browser
+WIDGET = "application/vnd.jupyter.widget-view+json"
 
 
 def test_a_query_is_chosen_and_the_saved_notebook_opens_without_widgets(

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from toolkit import geometry
 from toolkit.capture import Session, Trajectory, write_depth, write_session
 from toolkit.capture.depths import MAX_OFFSET_US, DepthMaps, SeenDepth
-from toolkit.synthetic.light import paint
-from toolkit.synthetic.render import Rays, render
+from toolkit.synthetic.render import Rays, paint, render
 from toolkit.synthetic.scene import Scene
 
 Floats = NDArray[np.float64]

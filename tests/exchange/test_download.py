@@ -25,10 +25,9 @@ from tests.fake_hub import FakeHub, serving, use_hub
 from toolkit import pipeline
 from toolkit.capture import Capture
 from toolkit.errors import CaptureError, DownloadError, ManifestError, sentence
-from toolkit.exchange import archives, transfer
+from toolkit.exchange import archives
 from toolkit.exchange import download as module
-from toolkit.exchange.archives import unpack
-from toolkit.exchange.datasets import arrange
+from toolkit.exchange.archives import arrange, unpack
 from toolkit.exchange.download import download, is_unfinished
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -52,7 +51,7 @@ dataset:
 @pytest.fixture
 def hub(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FakeHub]:
     """A hub on this machine in place of the real one."""
-    monkeypatch.setattr(transfer, "_ATTEMPTS", 3)
+    monkeypatch.setattr(module, "MAX_ATTEMPTS", 3)
     monkeypatch.setattr("huggingface_hub.constants.DOWNLOAD_CHUNK_SIZE", 1 << 18)  # only whole chunks are kept
     with serving(FakeHub()) as server:
         use_hub(monkeypatch, server.url, tmp_path)
@@ -131,14 +130,13 @@ def test_a_capture_is_fetched_unpacked_and_checked(
     hub: FakeHub, manifest: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     hub.page_size = 3  # so that the listing has several pages
-    lines: list[str] = []
-    (report,) = download(manifest, say=lines.append)
+    (report,) = download(manifest)
     assert found(manifest.parent) == capture_files()
     assert report.tables.keys() == {"ios_map", "ios_query"}
-    text = "\n".join(lines)
+    text, bar = capsys.readouterr()
     for part in (REPO, "commit 0123456", "to be looked at only", "A. Uthor, A Place", "6 files", "errors"):
         assert part in text
-    assert "100%" in capsys.readouterr().err
+    assert "100%" in bar
     assert not any(path.suffix == ".zip" for path in (manifest.parent / "captures").rglob("*"))
     hub.paths.clear()
     download(manifest)
@@ -184,21 +182,15 @@ def test_files_that_came_by_other_means_are_looked_at_and_kept(hub: FakeHub, man
     assert not any(path.endswith("/ios_map/images.txt") for path in hub.paths)
 
 
-def test_a_dry_run_lists_and_writes_nothing(hub: FakeHub, manifest: Path) -> None:
-    lines: list[str] = []
-    assert download(manifest, dry_run=True, say=lines.append) == []
+def test_a_dry_run_lists_and_writes_nothing(
+    hub: FakeHub, manifest: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert download(manifest, dry_run=True) == []
+    lines = capsys.readouterr().out.splitlines()
     size = len(hub.datasets[REPO]["ios_query.zip"])
     assert f"     {size / 1000:.1f} KB  sessions/ios_query.zip" in lines
     assert hub.paths == []
     assert not (manifest.parent / "captures").exists()
-
-
-def test_archives_can_be_kept(hub: FakeHub, manifest: Path) -> None:
-    download(manifest, keep_archives=True)
-    kept = (manifest.parent / "captures/PLACE/.download/archives").iterdir()
-    assert {path.read_bytes() for path in kept} == {
-        hub.datasets[REPO][name] for name in ("ios_map/raw_data.zip", "ios_query.zip")
-    }
 
 
 def test_further_files_by_pattern(hub: FakeHub, manifest: Path) -> None:
@@ -390,7 +382,7 @@ def test_parts_of_another_version_are_not_put_together(hub: FakeHub, manifest: P
 def test_a_large_file_is_asked_for_in_parts(
     hub: FakeHub, manifest: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(transfer, "_RANGE_BYTES", 300_000)
+    monkeypatch.setattr(module, "MAX_RANGE_BYTES", 300_000)
     download(manifest, ["ios_query"])
     assert found(manifest.parent) == session("ios_query")
     assert asked(hub) == ["bytes=0-", "bytes=300000-", "bytes=600000-"]
@@ -671,14 +663,14 @@ def lamar_archive() -> Files:
 
 
 def test_lamar_is_brought_into_the_capture_format(
-    hub: FakeHub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    hub: FakeHub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("CAPTURES", str(tmp_path / "captures"))
     hub.plain["/lamar/benchmark/CAB.zip"] = zipped(lamar_archive())
     address = f"dataset.sources.CAB.urls=['{hub.url}/lamar/benchmark/CAB.zip']"
     path = REPOSITORY / "data_manifests" / "lamar-cab.yaml"
-    lines: list[str] = []
-    download(path, overrides=[address], say=lines.append)
+    download(path, overrides=[address])
+    lines = capsys.readouterr().out.splitlines()
     assert any("left out of map: 1 subsessions of other devices, such as navvis_1" in line for line in lines)
     capture = Capture.open(tmp_path / "captures" / "CAB")
     assert capture.session_ids == ["hl_map", "hl_query", "ios_map", "ios_query"]

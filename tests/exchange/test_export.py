@@ -23,7 +23,7 @@ from toolkit.files import SceneFiles, pair_name
 from toolkit.geometry import invert, pose_from_qt
 from toolkit.mapping.build import build_map
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.result import MAPS
+from toolkit.results.pair import MAPS
 
 
 def write_localization(files: SceneFiles, map_device: str, query_device: str, maps: list[str]) -> None:

@@ -9,15 +9,15 @@ import pytest
 from tqdm import tqdm
 
 from tests.fake_hub import FakeHub, serving, use_hub
-from toolkit.exchange import transfer
-from toolkit.exchange.transfer import RemoteFile, fetch
+from toolkit.exchange import download
+from toolkit.exchange.download import RemoteFile
 
 BODY = random.Random(0).randbytes(600_000)
 
 
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FakeHub]:
-    monkeypatch.setattr(transfer, "_ATTEMPTS", 2)
+    monkeypatch.setattr(download, "MAX_ATTEMPTS", 2)
     monkeypatch.setattr("huggingface_hub.constants.DOWNLOAD_CHUNK_SIZE", 1000)
     with serving(FakeHub()) as hub:
         use_hub(monkeypatch, hub.url, tmp_path)
@@ -27,7 +27,7 @@ def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FakeHub]
 
 def fetch_to(partial: Path, server: FakeHub) -> None:
     with tqdm(disable=True) as bar:
-        fetch(RemoteFile("a.zip", f"{server.url}/a.zip", len(BODY), "etag:x"), partial, {}, bar)
+        RemoteFile("a.zip", f"{server.url}/a.zip", len(BODY), "etag:x").fetch(partial, {}, bar)
 
 
 @pytest.mark.parametrize("partial", [b"", BODY[:-1], BODY, BODY + b"more"])

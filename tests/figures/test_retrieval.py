@@ -17,13 +17,9 @@ from toolkit.retrieve import retrieve_pairs
 
 
 @pytest.fixture(scope="module")
-def pair(small_capture: Path, small_features: Path, tmp_path_factory: pytest.TempPathFactory) -> RetrievedPair:
-    from toolkit.embed import embed_sessions
-
-    folder = tmp_path_factory.mktemp("retrieved")
-    copy_shared(small_features, folder / "features")
-    sessions = small_capture / "sessions"
-    embed_sessions(sessions, folder / "embeddings", features_dir=folder / "features")
+def pair(small_capture: Path, small_embedded: Path, tmp_path_factory: pytest.TempPathFactory) -> RetrievedPair:
+    folder, sessions = tmp_path_factory.mktemp("retrieved") / "SMALL", small_capture / "sessions"
+    copy_shared(small_embedded, folder)
     pair = {"map_device": "hl", "query_device": "ios", "queries": "all"}
     retrieve_pairs(sessions, folder / "embeddings", folder / "retrieval", {"topk": 4}, **pair)
     (jsonl,) = (folder / "retrieval").glob("*.jsonl")

@@ -22,7 +22,7 @@ from toolkit.files import sidecar_path
 from toolkit.mapping import build as mapping
 from toolkit.mapping.build import MapSettings, build_map, select_pairs
 from toolkit.mapping.local_map import LocalMap
-from toolkit.mapping.triangulation import MAX_REPROJECTION_ERROR_PX, triangulate
+from toolkit.mapping.triangulation import MAX_REPROJECTION_ERROR_PX, refine_points, triangulate
 
 Floats = NDArray[np.float64]
 
@@ -419,7 +419,7 @@ def test_images_without_features_or_pose_are_left_out(phone: tuple[Session, Feat
     local_map = build_map(session, partial, tmp_path / "ios_map.npz")
     assert sorted(local_map.image_names) == sorted(partial)
     assert 0 < len(partial) < len(session.images)
-    with pytest.raises(ArtifactError, match="Session ios_map has no image with both"):
+    with pytest.raises(ArtifactError, match="ios_map has no image with a pose and local features"):
         build_map(session, FeatureStore(store.path, {}), tmp_path / "other.npz")
 
 
@@ -437,3 +437,13 @@ def test_a_map_of_a_single_image_has_no_points(tmp_path: Path) -> None:
     assert local_map.image_names == ["ios_map/raw_data/0.png"]
     assert len(local_map.points) == 0
     assert len(LocalMap.load(tmp_path / "map.npz").points) == 0
+
+
+def test_points_that_earlier_tiles_have_taken_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    ring = Ring(PINHOLE)
+    found = triangulate(ring.names, ring.cameras, ring.world_from_cams, ring.keypoints, ring.pairs, ring.matches)
+    observations = np.column_stack([found.obs_image, found.obs_keypoint, found.obs_point])
+    observations = observations[observations[:, 2] > 0]
+    monkeypatch.setattr("toolkit.mapping.triangulation._CHUNK", 1)  # the first chunk has no observation
+    refined = refine_points(found.points, observations, ring.cameras, ring.world_from_cams, ring.keypoints)
+    assert len(refined.points) == len(found.points) - 1

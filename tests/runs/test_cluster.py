@@ -188,15 +188,14 @@ def test_features_and_maps_are_those_of_one_process(small_capture: Path, tmp_pat
 @pytest.mark.slow
 @pytest.mark.parametrize("escalation", [[], ["other"]])
 def test_poses_are_those_of_one_process(
-    small_capture: Path, small_features: Path, tmp_path: Path, here: Here, monkeypatch: pytest.MonkeyPatch,
+    small_capture: Path, small_embedded: Path, tmp_path: Path, here: Here, monkeypatch: pytest.MonkeyPatch,
     escalation: list[str],
 ) -> None:  # fmt: skip
     add_other_kind(monkeypatch)
     settings = {"features": {"kinds": ["sift"], "escalation": escalation}, "pnp": {"ok_probability": 1.0}}
     files = SceneFiles(tmp_path / "run", small_capture.name)
-    copy_shared(small_features, files.features)
+    copy_shared(small_embedded, files.root)
     sessions = small_capture / "sessions"
-    embed_sessions(sessions, files.embeddings, features_dir=files.features)
     retrieve_pairs(sessions, files.embeddings, map_device="ios", out_jsonl=files.retrieval_dir, queries=LIST)
     found = {}
     for name in ("cluster", "alone"):

@@ -88,7 +88,6 @@ def test_warnings_of_kernels_are_found_once_and_ours_are_not(tmp_path: Path) -> 
     assert warnings_of_kernels(path, start) == []
     path.write_text(path.read_text().replace(f" {os.getpid()} ", " 1 ") * 2)
     assert warnings_of_kernels(path, start) == ["camera 1: WARNING toolkit.x: é", "of an earlier stage"]
-    assert warnings_of_kernels(tmp_path / "nothing.log", 0) == []
 
 
 def test_the_log_has_times_and_debug_messages_and_the_terminal_warnings_alone(tmp_path: Path) -> None:

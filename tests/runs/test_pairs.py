@@ -6,8 +6,8 @@ import pytest
 
 from toolkit.errors import CaptureError, DamagedError, ManifestError
 from toolkit.files import pair_devices
-from toolkit.runs.pairs import PairRows, left_out, left_out_of, way_out
-from toolkit.runs.record import failures
+from toolkit.runs.folder import failures
+from toolkit.runs.pairs import PairRows, left_out, left_out_of
 
 
 def test_the_devices_of_a_file_follow_from_its_name() -> None:
@@ -55,11 +55,6 @@ def test_an_error_of_the_settings_or_a_bug_stops_at_once(tmp_path: Path) -> None
     for error in (ManifestError("topk"), KeyError("a bug"), MemoryError(), DamagedError(tmp_path, "made again")):
         with pytest.raises(type(error)), table.row("ios", "hl"):
             raise error
-
-
-def test_the_way_out_names_the_device() -> None:
-    assert "`devices: [ios, spot]`" in way_out([("ios", "hl"), ("hl", "hl")], ["ios", "hl", "spot"])
-    assert "`devices:`" in way_out([("ios", "hl"), ("spot", "spot")], ["ios", "hl", "spot"])
 
 
 def test_failures_are_counted_once() -> None:

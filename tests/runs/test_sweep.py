@@ -1,14 +1,16 @@
 """Runs of a sweep: their names and settings, and what they take over from each other."""
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 
 from toolkit.errors import ManifestError
-from toolkit.files import SceneFiles
-from toolkit.manifest import load_manifest
+from toolkit.files import SceneFiles, write_text
+from toolkit.manifest import Manifest, load_manifest
 from toolkit.pipeline import sweep
 from toolkit.runs.sweep import changed_keys, swept_runs, take_over, variant_name
 from toolkit.store.items import Items
@@ -16,29 +18,29 @@ from toolkit.store.items import Items
 
 def test_a_run_a_value() -> None:
     runs = swept_runs("demo", ["localize.pnp.min_inliers=10, 20,40"])
-    assert [run.name for run in runs] == ["demo-min_inliers-10", "demo-min_inliers-20", "demo-min_inliers-40"]
-    assert runs[1].overrides == ("localize.pnp.min_inliers=20",)
+    assert list(runs) == ["demo-min_inliers-10", "demo-min_inliers-20", "demo-min_inliers-40"]
+    assert runs["demo-min_inliers-20"] == ["localize.pnp.min_inliers=20"]
 
 
 def test_two_keys_are_their_product() -> None:
     runs = swept_runs("demo", ["retrieve.topk=5,10", "localize.method=pnp,nearest"])
-    assert [run.overrides for run in runs] == [
-        ("retrieve.topk=5", "localize.method=pnp"), ("retrieve.topk=5", "localize.method=nearest"),
-        ("retrieve.topk=10", "localize.method=pnp"), ("retrieve.topk=10", "localize.method=nearest"),
+    assert list(runs.values()) == [
+        ["retrieve.topk=5", "localize.method=pnp"], ["retrieve.topk=5", "localize.method=nearest"],
+        ["retrieve.topk=10", "localize.method=pnp"], ["retrieve.topk=10", "localize.method=nearest"],
     ]  # fmt: skip
-    assert runs[3].name == "demo-topk-10-method-nearest"
+    assert list(runs)[3] == "demo-topk-10-method-nearest"
 
 
 def test_values_are_yaml() -> None:
     runs = swept_runs("x", ["embed.model=vlad,[megaloc, vlad],null"])
-    values = [yaml.safe_load(run.overrides[0].partition("=")[2]) for run in runs]
+    values = [yaml.safe_load(overrides[0].partition("=")[2]) for overrides in runs.values()]
     assert values == ["vlad", ["megaloc", "vlad"], None]
-    assert [run.name for run in runs] == ["x-model-vlad", "x-model-megaloc-vlad", "x-model-null"]
+    assert list(runs) == ["x-model-vlad", "x-model-megaloc-vlad", "x-model-null"]
 
 
 def test_keys_of_one_last_part_are_told_apart() -> None:
-    (run,) = swept_runs("x", ["embed.dtype_compute=auto", "localize.dtype_compute=auto"])
-    assert run.name == "x-embed.dtype_compute-auto-localize.dtype_compute-auto"
+    (name,) = swept_runs("x", ["embed.dtype_compute=auto", "localize.dtype_compute=auto"])
+    assert name == "x-embed.dtype_compute-auto-localize.dtype_compute-auto"
 
 
 @pytest.mark.parametrize(
@@ -51,13 +53,20 @@ def test_keys_of_one_last_part_are_told_apart() -> None:
         (["retrieve.topk=1", "retrieve.topk=2"], "twice"),
         (["embed.model=[a b],a b"], "the same folder name"),
         (["retrieve.topk=1,2", "demo_data.seed=0,1"], r"--sweep demo_data\.seed: .* --set demo_data\.seed="),
-        (["captures=[a],[b]"], "--sweep captures: all runs"),
+        (["captures=[a],[b]"], "--sweep captures: "),
         ([f"seed={','.join(map(str, range(101)))}"], "found 101 runs"),
     ],
 )
 def test_what_is_no_sweep_is_refused(sweeps: list[str], said: str) -> None:
     with pytest.raises(ManifestError, match=said):
         swept_runs("x", sweeps)
+
+
+def manifest(root: Path, name: str, **sections: Any) -> Manifest:
+    """The manifest of a run; its record as well."""
+    content = Manifest.of({"name": name, "captures": ["P"], "output_root": str(root), **sections})
+    write_text(root / name / "run.json", json.dumps({"manifest": content.model_dump(mode="json", exclude_none=True)}))
+    return content
 
 
 def test_a_run_takes_over_what_is_made_before_the_swept_stage(tmp_path: Path) -> None:
@@ -67,22 +76,28 @@ def test_a_run_takes_over_what_is_made_before_the_swept_stage(tmp_path: Path) ->
         folder.mkdir(parents=True)
         (folder / "made.txt").write_text("a")
         (folder / "made.h5").write_text("a")
-    take_over(donor.run, tmp_path / "b", ["P"], ["localize.method"])
+    manifest(tmp_path, "a")
+    far = manifest(tmp_path, "far", embed={"model": "megaloc"})
+    take_over([tmp_path / far.name, donor.run], manifest(tmp_path, "b", localize={"method": "nearest"}))
     mine = SceneFiles(tmp_path / "b", "P")
     assert sorted(path.name for path in mine.root.iterdir()) == ["embeddings", "features", "map", "retrieval"]
     assert (mine.features / "made.h5").samefile(donor.features / "made.h5")
     assert (mine.embeddings / "made.txt").samefile(donor.embeddings / "made.txt")
-    take_over(donor.run, tmp_path / "c", ["P"], ["evaluate.thresholds"])
-    assert (tmp_path / "c" / "P" / "poses").is_dir()
-    take_over(donor.run, tmp_path / "d", ["P"], ["embed.model", "localize.method"])
-    assert sorted(path.name for path in (tmp_path / "d" / "P").iterdir()) == ["features", "map"]
+    take_over([donor.run], manifest(tmp_path, "c", evaluate={"thresholds": [[1, 1]]}))
+    assert sorted(path.name for path in (tmp_path / "c" / "P").iterdir()) == [
+        "embeddings", "features", "map", "poses", "retrieval"
+    ]  # fmt: skip
+    for name, sections in (("d", {"embed": {"model": "megaloc"}}), ("e", {"queries": "all"})):
+        take_over([donor.run], manifest(tmp_path, name, **sections))
+        assert sorted(path.name for path in (tmp_path / name / "P").iterdir()) == ["features", "map"]
 
 
 def test_a_run_that_is_there_is_left_as_it_is(tmp_path: Path) -> None:
     donor, mine = SceneFiles(tmp_path / "a", "P"), SceneFiles(tmp_path / "b", "P")
     donor.embeddings.mkdir(parents=True)
     mine.root.mkdir(parents=True)
-    take_over(donor.run, mine.run, ["P"], ["localize.method"])
+    manifest(tmp_path, "a")
+    take_over([donor.run], manifest(tmp_path, "b"))
     assert not mine.embeddings.exists()
 
 
@@ -92,7 +107,7 @@ def test_what_is_added_to_a_linked_file_is_not_in_the_other_run(tmp_path: Path) 
         items.add("first", "source", {"values": np.zeros(3)})
     (shard,) = (donor.features / "made").iterdir()
     before = shard.read_bytes()
-    take_over(donor.run, mine.run, ["P"], ["localize.method"])
+    take_over([donor.run], manifest(tmp_path, "b"))
     with Items(mine.features / "made") as items:
         assert list(items) == ["first"]
         items.add("first", "source", {"values": np.ones(3)})

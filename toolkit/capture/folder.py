@@ -1,7 +1,8 @@
 """The folder of a capture and its sessions."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import product
 from pathlib import Path
 
 from toolkit.capture.devices import SPLITS, in_order, session_id, session_of
@@ -106,6 +107,14 @@ class Capture:
                 f"Devices with one: {', '.join(present) or 'none'} (or `all`)."
             )
         return [device]
+
+    def pairs(
+        self, map_device: str = "all", query_device: str = "all", pairs: Iterable[Sequence[str]] | None = None
+    ) -> list[tuple[str, str]]:
+        """Return (map device, query device) of all pairs of devices as in `devices_with`, or else the given `pairs`."""
+        if pairs is not None:
+            return [(map_, query) for map_, query in pairs]
+        return list(product(self.devices_with("map", map_device), self.devices_with("query", query_device)))
 
     def folder(self, session_id: str) -> Path:
         """Return the folder of a session."""

@@ -4,19 +4,24 @@
 
     unfinished-*     one for each session whose download has started and not finished
     done.jsonl       files that were fetched, verified and unpacked, one JSON object per line
-    partial/         files being fetched, named by a fingerprint of path and version
-    archives/        complete archives waiting to be unpacked
+    partial/         files being fetched and archives to be unpacked, named by a fingerprint of path and version
     unpacked/        an archive being unpacked
+
+`hf_hub_download` of huggingface_hub 2.4 and `retrieve` of pooch 1.9 fetch to a random name that no later process finds.
+`http_get`, which `hf_hub_download` is made of, appends to the file that it is given, resumes when a connection breaks,
+and waits as long as a busy server asks.
 """
 
 import fnmatch
+import hashlib
 import json
 import os
 import re
 import shutil
+import time
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -25,9 +30,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
 from toolkit.errors import DownloadError, ManifestError, ToolkitError
-from toolkit.exchange.archives import FileError, require_space, safe_path, size_text, unpack
-from toolkit.exchange.datasets import arrange
-from toolkit.exchange.transfer import WHOLE, RemoteFile, fetch
+from toolkit.exchange.archives import FileError, arrange, require_space, safe_path, size_text, unpack
 from toolkit.files import fingerprint
 from toolkit.manifest import DatasetSettings, Source, load_manifest, nearest
 from toolkit.models.hub import failure_reason, status_of
@@ -36,26 +39,27 @@ if TYPE_CHECKING:
     from toolkit.capture.check import CheckReport
 
 STATE = ".download"
+WHOLE = {"Accept-Encoding": "identity"}  # for each request: a compressed response could not be resumed in the middle
+MAX_ATTEMPTS = 6  # in a row that bring no data, besides those of http_get
+MAX_RANGE_BYTES = 32 << 30  # per request: the hub's content network does not answer requests for 50 GB
 _WORKERS = 8  # threads for small files, which mostly wait for the network; archives are fetched one by one
 
 
 def download(
     manifest_path: str | Path,
     sessions: Sequence[str] = (),
-    keep_archives: bool = False,
     dry_run: bool = False,
     overrides: Iterable[str] = (),
-    say: Callable[..., None] = print,
 ) -> "list[CheckReport]":
-    """Download the captures of a manifest into their folders and check them. Files already there are not fetched again.
+    """Download the captures of a manifest into their folders, check them, and print what is done.
+
+    Files already there are not fetched again.
 
     Args:
         manifest_path: YAML file with `captures` and a section `dataset`, see `toolkit.manifest`.
         sessions: download only these sessions of the manifest; default: all.
-        keep_archives: keep archives in `<capture>/.download/archives` after unpacking.
         dry_run: list what would be fetched, and write nothing.
         overrides: `key=value` or `section.key=value`, in place of the manifest's values.
-        say: called with each line of the report, like `print`.
 
     Returns:
         The check report of each capture; empty on a dry run.
@@ -75,9 +79,9 @@ def download(
     captures = []
     for folder in map(Path, manifest.captures):
         if source := dataset.sources.get(folder.name):
-            captures.append(_Capture(folder, dataset, source, names, keep_archives, say))
+            captures.append(_Capture(folder, dataset, source, names))
         else:
-            say(f"{folder.name}: nothing is fetched. dataset.sources: {nearest(folder.name, dataset.sources)}")
+            print(f"{folder.name}: nothing is fetched. dataset.sources: {nearest(folder.name, dataset.sources)}")
     if not captures:
         raise ManifestError(f"{manifest_path}: dataset.sources has no entry for any folder in `captures`.")
     needed_bytes: Counter[Path] = Counter()
@@ -104,6 +108,57 @@ def is_unfinished(capture: Path) -> bool:
     return any((capture / STATE).glob("unfinished-*"))
 
 
+@dataclass(frozen=True)
+class RemoteFile:
+    """A file to fetch."""
+
+    path: str  # target path relative to the capture's folder, with `/`. An archive is unpacked into its parent folder.
+    url: str
+    size: int
+    version: str  # the checksum of the file, `sha256:...` or `git:...`, else `etag:...` of the server
+
+    @property
+    def is_archive(self) -> bool:
+        return self.path.lower().endswith(".zip")
+
+    def matches(self, local: Path) -> bool:
+        """Return whether a local file has the size of this file, and its checksum if that is known."""
+        if _size(local) != self.size:
+            return False
+        kind, _, expected = self.version.partition(":")
+        # git: SHA-1 of a header and the content, https://git-scm.com/book/en/v2/Git-Internals-Git-Objects
+        digests = {"sha256": hashlib.sha256, "git": lambda: hashlib.sha1(b"blob %d\0" % self.size)}
+        with open(local, "rb") as stream:
+            return kind not in digests or hashlib.file_digest(stream, digests[kind]).hexdigest() == expected
+
+    def fetch(self, partial: Path, headers: Mapping[str, str], bar: Any) -> None:
+        """Fetch the missing bytes to `partial`, which may hold the first ones already, and advance a tqdm bar.
+
+        Raises:
+            Exception: an error of the disk, of huggingface_hub, or of its HTTP client; `partial` stays.
+        """
+        from huggingface_hub.file_download import http_get
+
+        failures, before = 0, _size(partial) or 0
+        while True:
+            try:
+                with open(partial, "ab") as out:
+                    if before > self.size:
+                        out.truncate(0)
+                    while (have := out.seek(0, os.SEEK_END)) < self.size:
+                        end = min(have + MAX_RANGE_BYTES, self.size)
+                        asked = {**headers, **WHOLE, "Range": f"bytes=0-{end - 1}"}  # http_get adds `have`
+                        http_get(self.url, out, resume_size=have, headers=asked, expected_size=end, _tqdm_bar=bar)
+                return
+            except Exception as error:  # the type for a connection that broke depends on the HTTP client's version
+                now = _size(partial) or 0
+                failures, before = (1 if now > before else failures + 1), now
+                is_of_the_machine = isinstance(error, ConnectionError) or getattr(error, "errno", None) is not None
+                if failures == MAX_ATTEMPTS or is_of_the_machine or (status_of(error) or 500) < 500:
+                    raise
+                time.sleep(2**failures)
+
+
 @dataclass
 class _Capture:
     """The download of one capture: the files of its source, the state on disk, and the steps."""
@@ -111,16 +166,12 @@ class _Capture:
     folder: Path
     dataset: DatasetSettings
     source: Source
-    names: dict[str, str]
-    """For each requested session, its name in the source."""
-    keep_archives: bool
-    say: Callable[..., None]
+    names: dict[str, str]  # for each requested session, its name in the source
 
     def __post_init__(self) -> None:
-        self.state = self.folder / STATE
-        hub, page = self.source.hub, f"https://huggingface.co/datasets/{self.source.hub}"
+        self.state, hub = self.folder / STATE, self.source.hub
         self.origin = f"dataset {hub} ({self.source.revision})" if hub else ", ".join(self.source.urls)
-        self.page = page if hub else self.dataset.page
+        self.page = f"https://huggingface.co/datasets/{hub}" if hub else self.dataset.page
         self.files: list[RemoteFile] = []
         self.bar: Any = None
         self.done: set[tuple[str, str, str]] = set()
@@ -144,10 +195,8 @@ class _Capture:
         self.files = [file for file in listed if self.source.urls or self._wants(file.path)]
         if not self.files:
             folders = sorted({"/".join(file.path.split("/")[:2]) for file in listed})
-            raise DownloadError(
-                f"{self.folder.name}: {self.origin} has no file for {', '.join(self.names.values())}. It has "
-                f"{', '.join(folders[:20]) or 'nothing'}. Correct `dataset.sessions` or `dataset.into`."
-            )
+            found, asked = ", ".join(folders[:20]) or "nothing", ", ".join(self.names.values())
+            raise DownloadError(f"{self.folder.name}: {self.origin} has no file for {asked}. It has {found}.")
 
     def _list_hub(self, repo: str) -> Iterator[RemoteFile]:
         from huggingface_hub import HfApi, hf_hub_url
@@ -180,24 +229,23 @@ class _Capture:
         kind = FileError if status_of(error) in (404, 416) else DownloadError
         reason = failure_reason(error, self.page, ", ".join(self.source.urls))
         return kind(
-            f"{what}: {reason}.\nCheck the network, HTTPS_PROXY, HF_ENDPOINT and HF_HUB_OFFLINE; that you have access "
-            f"to {self.page} (for the hub, log in with `hf auth login`); and by {self.dataset.page} that "
-            f"`dataset.sources.{self.folder.name}` is right. Then run the same command: it resumes the download."
+            f"{what}: {reason}.\nCheck the network, HTTPS_PROXY, HF_ENDPOINT, HF_HUB_OFFLINE, access to {self.page} "
+            f"(for the hub: `hf auth login`), and `dataset.sources.{self.folder.name}` by {self.dataset.page}. Then "
+            "run the same command: it resumes the download."
         )
 
     def _wants(self, path: str) -> bool:
         """Return whether to download the file with this path in the capture."""
-        return any(_is_of(path, session) for session in self.names.values()) or any(
-            fnmatch.fnmatchcase(path, pattern) for pattern in self.dataset.include
-        )
+        included = any(fnmatch.fnmatchcase(path, pattern) for pattern in self.dataset.include)
+        return included or any(_is_of(path, session) for session in self.names.values())
 
     def describe(self, in_full: bool) -> None:
         """Print what is fetched, from where, and under which license; `in_full` lists each file."""
         data, size = self.dataset, f"{len(self.files)} files, {size_text(sum(file.size for file in self.files))}"
-        self.say(f"{self.folder.name}: {self.origin}\n  to       {self.folder}\n  size     {size}")
-        self.say(f"  license  {data.license}\n  cite     {data.citation or '-'}\n  about    {data.page}")
+        print(f"{self.folder.name}: {self.origin}\n  to       {self.folder}\n  size     {size}")
+        print(f"  license  {data.license}\n  cite     {data.citation or '-'}\n  about    {data.page}")
         for file in self.files if in_full else ():
-            self.say(f"    {size_text(file.size):>9}  {file.path}")
+            print(f"    {size_text(file.size):>9}  {file.path}")
 
     # What is on disk
 
@@ -207,10 +255,9 @@ class _Capture:
         return own or [*self.names] if file.is_archive else [""]
 
     def _places(self, file: RemoteFile) -> tuple[Path, Path]:
-        """Return where a file is fetched to, and where it is put; the former depends on its version."""
+        """Return where a file is fetched to, and where it is put, or for an archive, unpacked from."""
         partial = self.state / "partial" / fingerprint([file.path, file.version])
-        archive = self.state / "archives" / f"{PurePosixPath(file.path).stem}-{partial.name}.zip"
-        return partial, archive if file.is_archive else self.folder / file.path
+        return partial, partial if file.is_archive else self.folder / file.path
 
     def _is_done(self, file: RemoteFile) -> bool:
         """Return whether this version of a file, or what an archive was unpacked to, is in place already."""
@@ -225,9 +272,8 @@ class _Capture:
         files = [file for file in self.files if not self._is_done(file)]
         have = [next((size for size in map(_size, reversed(self._places(file))) if size), 0) for file in files]
         # Images hardly shrink in an archive, so its size estimates the unpacked size. `unpack` checks the exact one.
-        packed = [file.size for file in files if file.is_archive and unpacked]
-        more = sum(packed) if self.keep_archives else max(packed, default=0)
-        return sum(max(0, file.size - size) for file, size in zip(files, have, strict=True)) + more
+        packed = max((file.size for file in files if file.is_archive and unpacked), default=0)
+        return sum(max(0, file.size - size) for file, size in zip(files, have, strict=True)) + packed
 
     # Fetch the files
 
@@ -244,12 +290,10 @@ class _Capture:
         except Timeout:
             raise DownloadError(f"{self.folder}: another download into this folder is running. Wait for it.") from None
         report = check_capture(self.folder)
-        self.say("\n" + report.text(most=20))
+        print("\n" + report.text(most=20))
         if missing := [name for name in self.names if name not in report.tables]:
-            raise DownloadError(
-                f"{self.folder}: {self.origin} is here, but there is no session {', '.join(missing)} in it; found "
-                f"{', '.join(report.tables)}. Correct `dataset.sessions`, or name those to download with --sessions."
-            )
+            found = f"there is no session {', '.join(missing)} in it; found {', '.join(report.tables)}"
+            raise DownloadError(f"{self.folder}: {self.origin} is here, but {found}. Correct `dataset.sessions`.")
         return report
 
     def _fetch_all(self) -> None:
@@ -268,10 +312,8 @@ class _Capture:
             errors = [*pool.map(self._obtain, [file for file in files if not file.is_archive])]
             errors += map(self._obtain, [file for file in files if file.is_archive])
         if failures := [str(error) for error in errors if error]:
-            raise DownloadError(
-                f"{self.folder.name}: {len(failures)} of {len(self.files)} files failed; the others are there. Run the "
-                "same command to try these again.\n  " + "\n  ".join(failures[:5])
-            )
+            some = f"{len(failures)} of {len(self.files)} files failed; the others are there. Run the command again."
+            raise DownloadError("\n  ".join([f"{self.folder.name}: {some}", *failures[:5]]))
         for mark in marks:
             mark.unlink()
         if not is_unfinished(self.folder):
@@ -290,7 +332,7 @@ class _Capture:
         row = {"path": file.path, "version": file.version, "sessions": self._sessions_in(file)}
         with open(self.state / "done.jsonl", "a", encoding="utf-8") as stream:  # one write, so threads need no lock
             stream.write("\n" + json.dumps(row))  # newline first: a kill may have cut off the previous line
-        if file.is_archive and not self.keep_archives:
+        if file.is_archive:
             target.unlink()
         return None
 
@@ -300,7 +342,7 @@ class _Capture:
         for path in (partial, target):
             path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            fetch(file, partial, build_hf_headers() if self.source.hub else {}, self.bar)  # the token
+            file.fetch(partial, build_hf_headers() if self.source.hub else {}, self.bar)  # the token
         except Exception as error:  # of the disk, the library, or its HTTP client, which depends on its version
             if getattr(error, "errno", None) is not None:
                 raise
@@ -310,11 +352,8 @@ class _Capture:
             raise self._failure(what, error) from error
         if not file.matches(partial):
             partial.unlink()
-            raise FileError(
-                f"{file.path}: wrong checksum, expected {file.version}; the fetched data were deleted. Run the same "
-                f"command again; if the error persists, the published file is damaged ({file.url}). Put a right one at "
-                f"{target}."
-            )
+            again = f"The data were deleted. Run the command again, or put a right file of {file.url} at {target}."
+            raise FileError(f"{file.path}: wrong checksum, expected {file.version}. {again}")
         partial.replace(target)
 
     def _unpack(self, file: RemoteFile, archive: Path) -> None:
@@ -332,7 +371,7 @@ class _Capture:
             unpack(archive, unpacked, target_path, file.path)
             if isinstance(self.dataset.sessions, dict):
                 for note in arrange(unpacked / "sessions", self.dataset.sessions):
-                    self.say(f"{self.folder.name}: left out of {note}")
+                    print(f"{self.folder.name}: left out of {note}")
                 for name in self.dataset.sessions.keys() - self.names.keys():  # split off but not requested
                     shutil.rmtree(unpacked / "sessions" / name, ignore_errors=True)
             shutil.copytree(unpacked, self.folder, copy_function=os.replace, dirs_exist_ok=True)

@@ -9,7 +9,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -43,10 +43,8 @@ class ImportReport:
     """The result of an import."""
 
     session: Path
-    images: pd.DataFrame
-    """One row per image: image, status (`imported` or why not), path, timestamp, sensor_id, device_id, camera."""
-    notes: list[str] = field(default_factory=list)
-    """Guesses, made-up values, and anything the user should look at."""
+    images: pd.DataFrame  # image, status (`imported` or why not), path, timestamp, sensor_id, device_id, camera
+    notes: list[str] = field(default_factory=list)  # guesses, made-up values, and anything the user should look at
 
     def text(self) -> str:
         """Return the report as text."""
@@ -67,12 +65,10 @@ class DraftImage:
     name: str
     camera: pycolmap.Camera
     sensor: str
-    frame: str
-    """Images with the same frame were taken at the same time."""
+    frame: str  # images with the same frame were taken at the same time
     rig: str | None = None
     time_us: int | None = None
-    turned: bool = False
-    """Whether the EXIF orientation says to rotate the image."""
+    turned: bool = False  # whether the EXIF orientation says to rotate the image
 
     @property
     def path(self) -> str:
@@ -89,21 +85,15 @@ class Draft:
     """A session being assembled."""
 
     session: Path
-    folder: Path
-    """Folder of the images."""
+    folder: Path  # folder of the images
     placing: str
     images: list[DraftImage] = field(default_factory=list)
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    """Rows of `proc/import.csv`."""
-    poses: dict[str, Floats] = field(default_factory=dict)
-    """world_from_device (4, 4) by frame; query frames may have none."""
-    rigs: list[tuple[str, str, Floats]] = field(default_factory=list)
-    """Rig, sensor, rig_from_sensor (4, 4)."""
-    unit: str | None = "m"
-    """Unit of the poses; None: unknown."""
+    rows: list[dict[str, Any]] = field(default_factory=list)  # rows of `proc/import.csv`
+    poses: dict[str, Floats] = field(default_factory=dict)  # world_from_device (4, 4) by frame; queries may have none
+    rigs: list[tuple[str, str, Floats]] = field(default_factory=list)  # rig, sensor, rig_from_sensor (4, 4)
+    unit: str | None = "m"  # unit of the poses; None: unknown
     notes: list[str] = field(default_factory=list)
-    sensors: dict[str, str] = field(default_factory=dict)
-    """Sensor id by `camera_text`, for images that are not in a rig."""
+    sensors: dict[str, str] = field(default_factory=dict)  # id by `camera_text`, for images that are not in a rig
 
     def add(self, name: str, camera: pycolmap.Camera, world_from_cam: Floats | None) -> None:
         """Add an image that is not in a rig. Images with equal intrinsics share a camera."""
@@ -118,22 +108,20 @@ class Draft:
         self.rows += [{"image": name, "status": problem} for name, problem in problems.items() if problem]
         self.images = [image for image in self.images if not problems[image.name]]
         if not self.images:
-            why = f" First: {self.rows[0]['image']}: {self.rows[0]['status']}." if self.rows else ""
-            if self.rows and self.rows[0]["status"] in (NO_FILE, NOT_INSIDE):
-                why += " Names are paths in this folder: correct them in the list, or put the list beside the images."
-            raise CaptureError(f"{self.folder}: none of {len(self.rows)} images can be imported.{why}")
+            name, status = (self.rows[0]["image"], self.rows[0]["status"]) if self.rows else ("", "there is none")
+            where = " Names are paths in this folder: correct them in the list, or put the list beside the images."
+            why = f"First: {name}: {status}.{where if status in (NO_FILE, NOT_INSIDE) else ''}"
+            raise CaptureError(f"{self.folder}: none of {len(self.rows)} images can be imported. {why}")
 
     def write(self) -> ImportReport:
         """Write the session; call `leave_out` before."""
         if turned := sum(image.turned for image in self.images):
             self.notes.append(f"{turned} images have an EXIF orientation, which is ignored: pixels are used as stored")
         times = self._choose_times()
-        self.rows += [
-            {"image": image.name, "status": "imported", "path": image.path, "timestamp": times[image.frame],
-             "sensor_id": image.sensor, "device_id": image.device, "camera": camera_text(image.camera)}
-            for image in self.images
-        ]  # fmt: skip
         columns = ["image", "status", "path", "timestamp", "sensor_id", "device_id", "camera"]
+        for image in self.images:
+            values = image.path, times[image.frame], image.sensor, image.device, camera_text(image.camera)
+            self.rows.append(dict(zip(columns, (image.name, "imported", *values), strict=True)))
         table = pd.DataFrame(self.rows, columns=columns).astype({"timestamp": "Int64"})
         with write_folder(self.session) as session:
             for image in self.images:
@@ -187,13 +175,12 @@ class Draft:
             return str(error)
         orientation, camera = read_number(exif, ORIENTATION), image.camera
         image.turned, image.time_us = orientation > 1, time_taken(exif)
+        (width, height), sides = size, (*size, camera.width, camera.height)
         if size == (camera.width, camera.height):
             return ""
-        stored = f"{size[0]} x {size[1]}"
-        problem = f"the image is stored as {stored} pixels, its camera has {camera.width} x {camera.height}"
-        sides = (*size, camera.width, camera.height)
-        if abs(size[0] * camera.height - size[1] * camera.width) <= max(sides) / 2:  # equal ratio up to rounding
-            factor = size[0] / camera.width
+        problem = f"the image is stored as {width} x {height} pixels, its camera has {camera.width} x {camera.height}"
+        if abs(width * camera.height - height * camera.width) <= max(sides) / 2:  # equal ratio up to rounding
+            factor = width / camera.width
             problem += f"; use images of the camera's size, or multiply its intrinsics by {factor:.6g}"
         if orientation > 4 and size == (camera.height, camera.width):
             problem += "; the camera fits the rotated image: rotate the pixels and remove the EXIF orientation"
@@ -206,8 +193,8 @@ class Draft:
         if len(taken) == len(frames) == len(set(taken.values())):
             self.notes.append("timestamps: camera clock, from EXIF")
             return taken
-        why = "some images have no time" if len(taken) < len(frames) else "some images have the same time"
-        self.notes.append(f"timestamps: made up, one second apart in the order of the images ({why} in EXIF)")
+        why = f"some images have {'no' if len(taken) < len(frames) else 'the same'} time in EXIF"
+        self.notes.append(f"timestamps: made up, one second apart in the order of the images ({why})")
         return {frame: (number + 1) * 10**6 for number, frame in enumerate(frames)}
 
 
@@ -236,31 +223,25 @@ def write_drafts(*drafts: Draft) -> list[ImportReport]:
     return [draft.write() for draft in drafts]
 
 
-def list_images(folder: Path) -> pd.DataFrame:
-    """Return the images in and below a folder, sorted by name, as a table [image, line] with line 0.
-
-    Links to folders elsewhere are followed.
+def list_images(folder: Path) -> list[str]:
+    """Return the images in and below a folder, sorted by path. Links to folders elsewhere are followed, each once.
 
     Raises:
         CaptureError: there is no image.
     """
-    paths = sorted(path for path in _files_below(folder) if path.suffix.lower() in IMAGE_SUFFIXES)
-    if not paths:
-        raise CaptureError(f"{folder}: no image in or below it. Expected {', '.join(IMAGE_SUFFIXES)}.")
-    return pd.DataFrame({"image": [path.relative_to(folder).as_posix() for path in paths], "line": 0})
-
-
-def _files_below(folder: Path) -> Iterator[Path]:
-    """Yield the files in and below a folder. Links to folders elsewhere are followed, each target once."""
-    visited = [folder.resolve()]
-    for root, folders, names in os.walk(folder, followlinks=True):
+    visited, names = [folder.resolve()], list[str]()
+    for root, folders, files in os.walk(folder, followlinks=True):
         for link in [name for name in folders if Path(root, name).is_symlink()]:
             target = Path(root, link).resolve()
             if any(target.is_relative_to(path) or path.is_relative_to(target) for path in visited):
                 folders.remove(link)
             else:
                 visited.append(target)
-        yield from (Path(root, name) for name in names)
+        names += [Path(root, name).relative_to(folder).as_posix() for name in files]
+    names = sorted((name for name in names if name.lower().endswith(IMAGE_SUFFIXES)), key=Path)
+    if not names:
+        raise CaptureError(f"{folder}: no image in or below it. Expected {', '.join(IMAGE_SUFFIXES)}.")
+    return names
 
 
 def posed_camera(world_from_named: Floats, axes: str, unit_m: float) -> Floats:

@@ -8,7 +8,7 @@ The run records where its captures are; `capture` is the new folder of one that 
 ManifestError for an unknown choice of names, a capture that is in neither place, or a capture with another name.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,6 +41,7 @@ from toolkit.mapping.local_map import LocalMap
 from toolkit.results.pair import PairResults
 
 NAMES = ("own", "capture")
+_LOCALIZE = "Run the localize stage first (python -m toolkit run MANIFEST --only localize)."
 Keypoints = Mapping[str, NDArray[np.floating]]
 
 
@@ -63,10 +64,17 @@ def export_colmap(
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ManifestError(f"{out}: contains files already. Give an empty or new folder.")
     session = _session(run, scene, session_id, capture)
-    paths = _maps_of(files, device)
-    stores = [_features_of(files, session_id, path) for path in paths]
-    local_map, keypoints = _pooled([LocalMap.load(path) for path in paths], stores)
-    model = colmap_model(local_map, session, keypoints, names)
+    maps, keypoints = [], dict[str, NDArray[np.floating]]()
+    for path in _maps_of(files, device):
+        kind = path.stem.removeprefix(session_id).removeprefix("-") or "sift"  # the naming of `mapping.map_path`
+        local_map, store = LocalMap.load(path), FeatureStore.open(only_features(files, session_id, kind))
+        # In each image, the keypoints of this kind follow those of the kinds before.
+        before = [keypoints.get(name, np.zeros((0, 2))) for name in local_map.image_names]
+        starts = np.array([len(xy) for xy in before], np.int64)
+        maps.append(replace(local_map, obs_keypoint=local_map.obs_keypoint + starts[local_map.obs_image]))
+        for name, xy in zip(local_map.image_names, before, strict=True):
+            keypoints[name] = np.concatenate([xy, store[name].keypoints])
+    model = colmap_model(LocalMap.pooled(maps), session, keypoints, names)
     with write_folder(out) as folder:
         model.write_binary(str(folder))
     return model
@@ -79,16 +87,7 @@ def _maps_of(files: SceneFiles, device: str) -> list[Path]:
         if maps:
             require_current(path.with_suffix(".txt"), "localize", (".npz",))
             return maps
-    raise ArtifactError(
-        f"{files.poses_dir}: no query was localized in a triangulated map of {device}. Run the localize stage with a "
-        "method that uses one (python -m toolkit run MANIFEST --only localize)."
-    )
-
-
-def _features_of(files: SceneFiles, session_id: str, map_file: Path) -> FeatureStore:
-    """Open the local features that a map was triangulated from."""
-    kind = map_file.stem.removeprefix(session_id).removeprefix("-") or "sift"  # the naming of `mapping.map_path`
-    return FeatureStore.open(only_features(files, session_id, kind))
+    raise ArtifactError(f"{files.poses_dir}: no query was localized in a triangulated map of {device}. {_LOCALIZE}")
 
 
 def only_features(files: SceneFiles, session_id: str, kind: str) -> Path:
@@ -96,24 +95,9 @@ def only_features(files: SceneFiles, session_id: str, kind: str) -> Path:
     folder = files.features / session_id
     stores = [path for path in sorted(folder.glob(f"{kind}-*")) if path.is_dir()]
     if len(stores) != 1:
-        raise ArtifactError(
-            f"{folder}: {len(stores)} folders of {kind} features, expected the one that the run localized with. Delete "
-            "this folder and run the localize stage again."
-        )
+        found = f"{len(stores)} folders of {kind} features, expected one"
+        raise ArtifactError(f"{folder}: {found}. Delete this folder and run the localize stage again.")
     return stores[0]
-
-
-def _pooled(maps: Sequence[LocalMap], stores: Sequence[FeatureStore]) -> tuple[LocalMap, Keypoints]:
-    """Merge the maps of several kinds of features; in each image, concatenate the keypoints (n, 2) of all kinds."""
-    keypoints: dict[str, NDArray[np.floating]] = {}
-    shifted = []
-    for local_map, store in zip(maps, stores, strict=True):
-        previous = [keypoints.get(name, np.zeros((0, 2))) for name in local_map.image_names]
-        starts = np.array([len(xy) for xy in previous], np.int64)
-        shifted.append(replace(local_map, obs_keypoint=local_map.obs_keypoint + starts[local_map.obs_image]))
-        for name, xy in zip(local_map.image_names, previous, strict=True):
-            keypoints[name] = np.concatenate([xy, store[name].keypoints])
-    return LocalMap.pooled(shifted), keypoints
 
 
 def colmap_model(
@@ -154,11 +138,9 @@ def colmap_model(
             image = pycolmap.Image(_exported(name, names), keypoints[name].astype(np.float64), camera_id, member + 1)
             image.frame_id = frame_id
             model.add_image(image)
-    order = np.argsort(local_map.obs_point, kind="stable")
-    starts = np.searchsorted(local_map.obs_point[order], np.arange(len(local_map.points) + 1))
     for point, (xyz, color) in enumerate(zip(local_map.points, local_map.colors, strict=True)):
         track = pycolmap.Track()
-        for obs in order[starts[point] : starts[point + 1]]:
+        for obs in local_map.by_point[slice(*local_map.point_starts[point : point + 2])]:
             track.add_element(int(local_map.obs_image[obs]) + 1, int(local_map.obs_keypoint[obs]))
         model.add_point3D(xyz, track, color)
     model.update_point_3d_errors()
@@ -218,14 +200,9 @@ def export_table(session: Session, out: str | Path, ground_truth: bool = False) 
 
 
 def export_pairs(
-    run: str | Path,
-    scene: str,
-    map_device: str,
-    query_device: str,
-    out: str | Path,
-    topk: int | None = None,
+    run: str | Path, scene: str, map_device: str, query_device: str, out: str | Path, topk: int | None = None,
     names: str = "own",
-) -> int:
+) -> int:  # fmt: skip
     """Write the retrieval of a pair in hloc's format, `query reference` per line, and return the number of lines.
 
     Args:
@@ -247,23 +224,15 @@ def export_pairs(
         query, *references = (_listed(image_name(name), names, path) for name in paths)
         pairs += [(query, reference) for reference in references]
     if shared := {query for query, _ in pairs} & {reference for _, reference in pairs}:
-        raise ArtifactError(
-            f"{path}: {min(shared)!r} is the name of a query and of a reference, which hloc cannot tell apart. Use "
-            "--names capture."
-        )
-    write_text(out, "".join(f"{query} {reference}\n" for query, reference in pairs))
-    return len(pairs)
+        both = f"{min(shared)!r} is the name of a query and of a reference"
+        raise ArtifactError(f"{path}: {both}, which hloc cannot tell apart. Use --names capture.")
+    return _write_list(out, pairs)
 
 
 def export_poses(
-    run: str | Path,
-    scene: str,
-    map_device: str,
-    query_device: str,
-    out: str | Path,
-    capture: str | Path | None = None,
+    run: str | Path, scene: str, map_device: str, query_device: str, out: str | Path, capture: str | Path | None = None,
     names: str = "own",
-) -> int:
+) -> int:  # fmt: skip
     """Write the poses of a pair's queries in hloc's format, `name qw qx qy qz tx ty tz` for each image.
 
     Poses are cam_from_world in the unit of the capture; a rig has one line per camera. Queries without a pose are left
@@ -281,20 +250,14 @@ def export_poses(
     for rows, world_from_rig in zip(session.rows_of_keyframes(keys), pose_from_qt(poses.qt), strict=True):
         for row, cam_from_world in zip(rows, invert(world_from_rig @ session.rig_from_cam(rows)), strict=True):
             numbers = (repr(float(value)) for value in qt_from_pose(cam_from_world))
-            lines.append(" ".join([_listed(session.image_name(row), names, path), *numbers]))
-    write_text(out, "".join(f"{line}\n" for line in lines))
-    return len(lines)
+            lines.append((_listed(session.image_name(row), names, path), *numbers))
+    return _write_list(out, lines)
 
 
 def export_intrinsics(
-    run: str | Path,
-    scene: str,
-    map_device: str,
-    query_device: str,
-    out: str | Path,
-    capture: str | Path | None = None,
+    run: str | Path, scene: str, map_device: str, query_device: str, out: str | Path, capture: str | Path | None = None,
     names: str = "own",
-) -> int:
+) -> int:  # fmt: skip
     """Write the cameras of a pair's queries in hloc's format, `name MODEL width height parameters` for each image.
 
     Queries without a pose are included. Returns and errors are those of `export_poses`.
@@ -302,12 +265,15 @@ def export_intrinsics(
     _require_names(names)
     path = _require_poses(SceneFiles(Path(run), scene).poses_csv(map_device, query_device))
     session = _session(run, scene, f"{query_device}_query", capture)
-    lines = []
-    for rows in session.rows_of_keyframes(PairResults.open(path).table):
-        for row in rows:
-            camera = camera_text(session.camera(str(session.images["sensor_id"].iloc[row]))).replace(",", "")
-            lines.append(f"{_listed(session.image_name(row), names, path)} {camera}")
-    write_text(out, "".join(f"{line}\n" for line in lines))
+    rows = [row for rows in session.rows_of_keyframes(PairResults.open(path).table) for row in rows]
+    cameras = [camera_text(camera).replace(",", "") for camera in session.cameras(rows)]
+    listed = [_listed(session.image_name(row), names, path) for row in rows]
+    return _write_list(out, zip(listed, cameras, strict=True))
+
+
+def _write_list(out: str | Path, rows: Iterable[tuple[str, ...]]) -> int:
+    lines = [f"{' '.join(row)}\n" for row in rows]
+    write_text(out, "".join(lines))
     return len(lines)
 
 
@@ -332,10 +298,7 @@ def _listed(name: str, names: str, path: Path) -> str:
 def _require_poses(path: Path) -> Path:
     """Return the path of a result of the localize stage. Raise ArtifactError if it is missing or damaged."""
     if not path.is_file():
-        raise ArtifactError(
-            f"No poses: {path} is missing. Run the localize stage first "
-            "(python -m toolkit run MANIFEST --only localize)."
-        )
+        raise ArtifactError(f"No poses: {path} is missing. {_LOCALIZE}")
     require_whole(path, of=path.with_suffix(".txt"))
     require_current(path.with_suffix(".txt"), "localize", missing=False)
     return path

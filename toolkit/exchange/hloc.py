@@ -70,9 +70,7 @@ def import_features(path: str | Path, out: str | Path) -> FeatureStore:
         offset = _HALF_PIXEL - np.float32(file.attrs.get(PIXEL_CENTER, 0.0))
         names = group_names_of(file, "keypoints")
         if not names:
-            raise ArtifactError(
-                f"{path} holds no local features; expected a group for each image with `keypoints` and `descriptors`."
-            )
+            raise ArtifactError(f"{path} holds no local features; expected a group with `keypoints` for each image.")
         for name in names:
             try:
                 features = _from_hloc(read_group(file, name), offset)
@@ -114,10 +112,8 @@ def export_matches(
     tiles = [Items(path) for path in sorted(folder.glob(f"{kind}-*")) if path.is_dir()]  # a large map has several
     made_by = [{key: value for key, value in tile.made_by.items() if key != "tile"} for tile in tiles if tile]
     if not made_by or any(other != made_by[0] for other in made_by):
-        raise ArtifactError(
-            f"{folder}: found matches of {kind} of {len(made_by)} settings, expected one. Delete this folder and run "
-            "the localize stage again."
-        )
+        found = f"found matches of {kind} of {len(made_by)} settings, expected one"
+        raise ArtifactError(f"{folder}: {found}. Delete this folder and run the localize stage again.")
     first = FeatureStore.open(features_path(files.features, session0, made_by[0]["features"][0]))
     groups: dict[str, tuple[str, str]] = {}
 
@@ -128,9 +124,8 @@ def export_matches(
                 name0, _, name1 = item.partition("\n")
                 names = name0, name1
                 if names != groups.setdefault(_group(*names), names):
-                    raise ArtifactError(
-                        f"{folder}: hloc cannot tell the pairs {names} and {groups[_group(*names)]} apart. Rename one."
-                    )
+                    other = groups[_group(*names)]
+                    raise ArtifactError(f"{folder}: hloc cannot tell the pairs {names} and {other} apart. Rename one.")
                 yield _group(*names), _matches_to_hloc(matches[names], len(first[names[0]]))
 
     write_groups(Path(out), written(), {})
@@ -164,11 +159,8 @@ def import_matches(path: str | Path, pairs: Iterable[tuple[str, str]], out: str 
             arrays = read_group(file, _group(*names[::step]))
             partners, scores = (arrays.get(key, np.zeros(())) for key in ("matches0", "matching_scores0"))
             if partners.ndim != 1 or partners.dtype.kind not in "iu" or scores.shape != partners.shape:
-                raise DamagedError(
-                    path,
-                    f"{path}: {names} are not in the layout of hloc; expected matches0 (N,), whole numbers, and "
-                    f"matching_scores0 (N,), found {', '.join(f'{key} {a.shape}' for key, a in arrays.items())}.",
-                )
+                expected = "expected matches0 (N,), whole numbers, and matching_scores0 (N,)"
+                raise DamagedError(path, f"{path}: {names} are not in the layout of hloc; {expected}.")
             at = np.flatnonzero(partners >= 0)
             indices = np.stack([at, partners[at].astype(np.int64)], axis=1)[:, ::step]
             write_matches(items, match_name(*names), made_from, PairMatches(indices, scores[at].astype(np.float32)))

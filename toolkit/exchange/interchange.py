@@ -47,13 +47,9 @@ _CAMERA_COLUMNS = ("model", "width", "height", "params")
 
 
 def import_colmap(
-    model: str | Path,
-    images: str | Path,
-    capture: str | Path,
-    device: str = "ios",
-    split: str = "map",
+    model: str | Path, images: str | Path, capture: str | Path, device: str = "ios", split: str = "map",
     placing: str = "link",
-) -> ImportReport:
+) -> ImportReport:  # fmt: skip
     """Make a session from a COLMAP model and its images: cameras, poses, and the rigs that have several cameras.
 
     The capture format supports all camera models of COLMAP, so they are kept without undistortion. Points and tracks
@@ -88,26 +84,17 @@ def import_colmap(
         frame, sensor_name = f"{image.frame_id}", f"{SUBSESSION}/cam_{image.camera_id}"
         draft.images.append(DraftImage(image.name, image.camera, sensor_name, frame, rig_name))
         draft.poses[frame] = _inverse(image.frame.rig_from_world if rig_name else image.cam_from_world())
-    not_in_model = set(list_images(draft.folder)["image"]) - {image.name for image in draft.images}
+    not_in_model = set(list_images(draft.folder)) - {image.name for image in draft.images}
     if not_in_model:
         draft.notes.append(f"{len(not_in_model)} images of the folder are not in the model")
     return write_drafts(draft)[0]
 
 
 def import_images(
-    images: str | Path,
-    capture: str | Path,
-    device: str = "ios",
-    split: str = "query",
-    table: str | Path | None = None,
-    poses_are: str = "world_from_cam",
-    camera: str | None = None,
-    cameras: str | Path | None = None,
-    placing: str = "link",
-    axes: str = "opencv",
-    unit_m: float = 1.0,
-    truth: str | Path | None = None,
-) -> ImportReport:
+    images: str | Path, capture: str | Path, device: str = "ios", split: str = "query", table: str | Path | None = None,
+    poses_are: str = "world_from_cam", camera: str | None = None, cameras: str | Path | None = None,
+    placing: str = "link", axes: str = "opencv", unit_m: float = 1.0, truth: str | Path | None = None,
+) -> ImportReport:  # fmt: skip
     """Make a session from a folder of images without rigs.
 
     Intrinsics come from the table, else from `cameras`, else from `camera`, else they are guessed from each image's
@@ -138,12 +125,10 @@ def import_images(
     draft, folder = start(capture, device, split, Path(images), placing), Path(images)
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder of images.")
-    rows = _read_table(Path(table)) if table is not None else list_images(folder)
+    rows = _read_table(Path(table)) if table is not None else pd.DataFrame({"image": list_images(folder), "line": 0})
     if split == "map" and "qw" not in rows:
-        raise CaptureError(
-            f"A map needs poses: give a table with the columns image, {', '.join(POSE_NAMES)}, or import a "
-            "transforms.json or a COLMAP model (`python -m toolkit import --help`)."
-        )
+        given = f"a table with the columns image, {', '.join(POSE_NAMES)}"
+        raise CaptureError(f"A map needs poses: give {given}, or import a transforms.json or a COLMAP model.")
     listed_cameras = _read_cameras(Path(cameras)) if cameras is not None else {}
     shared_camera = None if camera is None else _camera(camera, "camera")
     posed = rows if truth is None else _read_truth(Path(truth), rows, split)
@@ -189,13 +174,16 @@ def import_once(
             inputs[name] = str(Path(inputs[name]).resolve())
     if inputs.get("camera") is not None and _has_cameras(table=options.get("table"), cameras=options.get("cameras")):
         inputs["camera"] = None  # the table or cameras.txt override it
-    inputs["files of images"] = files_fingerprint([Path(images) / name for name in list_images(Path(images))["image"]])
+    inputs["files of images"] = files_fingerprint([Path(images) / name for name in list_images(Path(images))])
     record = session / IMPORT_RECORD
     if not session.exists():
-        if _is_transforms(options.get("table")):
-            poses_are = options.get("poses_are", POSE_DIRECTIONS[0])
-            _require_own_folder(Path(images), Path(options["table"]), split, poses_are)
-            report = import_transforms(options["table"], capture, device, split, unit_m=unit_m)[0]
+        file = options.get("table")
+        if file is not None and _is_transforms(file):
+            if Path(images).resolve() != Path(file).resolve().parent:
+                raise ManifestError(f"{split}_images: found {images}, expected the folder of {file}.")
+            if (found := options.get("poses_are", POSE_DIRECTIONS[0])) != POSE_DIRECTIONS[0]:
+                raise ManifestError(f"poses_are: found {found!r}, expected world_from_cam, the direction in {file}.")
+            report = import_transforms(file, capture, device, split, unit_m=unit_m)[0]
         else:
             report = import_images(images, capture, device, split, unit_m=unit_m or 1.0, **options)
         unknown = {"unit": None} if unit_m is None else {}
@@ -209,22 +197,13 @@ def import_once(
             for name in differing
         )  # fmt: skip
         raise CaptureError(
-            f"{session} was imported from other input ({changes}). Give another folder for the capture, or delete this "
-            "one to import it again."
+            f"{session} was imported from other input ({changes}). Delete it to import again, or give another capture."
         )
     return f"{session}: imported before from the same input, kept"
 
 
 def _is_transforms(table: str | Path | None) -> bool:
     return table is not None and Path(table).suffix == ".json"
-
-
-def _require_own_folder(images: Path, file: Path, split: str, poses_are: str) -> None:
-    """Raise ManifestError unless a transforms.json is in the folder of images and its poses are world_from_cam."""
-    if images.resolve() != file.resolve().parent:
-        raise ManifestError(f"{split}_images: found {images}, expected the folder of {file}: its paths start there.")
-    if poses_are != POSE_DIRECTIONS[0]:
-        raise ManifestError(f"poses_are: found {poses_are!r}, expected world_from_cam, the direction in {file}.")
 
 
 _PROBE = """
@@ -261,10 +240,8 @@ def _read_model(folder: Path) -> pycolmap.Reconstruction:
     except subprocess.TimeoutExpired:
         probe, reason = None, f"COLMAP did not finish in {limit_s:.0f} s"
     if probe is None or probe.returncode:
-        raise CaptureError(
-            f"{folder}: cannot be read as a COLMAP model ({reason}). Expected cameras, images, points3D as .bin or "
-            ".txt."
-        )
+        expected = "Expected cameras, images, points3D as .bin or .txt."
+        raise CaptureError(f"{folder}: cannot be read as a COLMAP model ({reason}). {expected}")
     return pycolmap.Reconstruction(str(folder))
 
 
@@ -294,9 +271,7 @@ def _camera_of(
             raise CaptureError(f"{where}: camera_id {row['camera_id']!r} is not in cameras.txt (it has: {ids}).")
         return by_id[row["camera_id"]], "those of cameras.txt"
     if len(by_id) > 1:
-        raise CaptureError(
-            f"cameras.txt has {len(by_id)} cameras; give a table with the columns image, camera_id to assign them."
-        )
+        raise CaptureError(f"cameras.txt has {len(by_id)} cameras; give a table with the columns image, camera_id.")
     if by_id:
         return next(iter(by_id.values())), "the camera of cameras.txt"
     return (shared, "the given camera") if shared is not None else exif_camera(path)
@@ -339,10 +314,8 @@ def _read_truth(path: Path, images: pd.DataFrame, split: str) -> pd.DataFrame:
         raise CaptureError(f"{path}: no poses in it. Expected the columns image, {', '.join(POSE_NAMES)}.")
     if not set(rows["image"]) & set(images["image"]):
         names = [repr(next(iter(table["image"]), "")) for table in (rows, images)]
-        raise CaptureError(
-            f"{path}: no row is about an imported image: found {names[0]} and others, expected {names[1]} and others. "
-            "Images are named by their path in the folder of images."
-        )
+        found = f"found {names[0]} and others, expected {names[1]} and others, paths in the folder of images"
+        raise CaptureError(f"{path}: no row is about an imported image: {found}.")
     return rows
 
 
@@ -358,9 +331,7 @@ def _poses_of(rows: pd.DataFrame, poses_are: str, axes: str, unit_m: float) -> d
 def _read_table(path: Path) -> pd.DataFrame:
     """Read the table of a folder of images, all values as text, with the additional column `line`."""
     if _is_transforms(path):
-        raise CaptureError(
-            f"{path}: not a CSV table. Import a transforms.json with: python -m toolkit import transforms"
-        )
+        raise CaptureError(f"{path}: not a CSV table. Import it by python -m toolkit import transforms.")
     try:
         text = path.read_text(encoding="utf-8-sig")  # spreadsheets write the mark
     except (OSError, UnicodeDecodeError) as error:
@@ -388,10 +359,9 @@ def _read_table(path: Path) -> pd.DataFrame:
         wrong |= np.abs(np.linalg.norm(np.nan_to_num(values[:, :4]), axis=1) - 1) > 1e-3
         if wrong.any():
             row = rows.iloc[int(np.argmax(wrong))]
-            raise CaptureError(
-                f"{path}, line {row['line']}: found the pose {', '.join(row[list(POSE_NAMES)])}; expected seven finite "
-                "numbers, qw qx qy qz of length 1 and tx ty tz."
-            )
+            found = ", ".join(row[list(POSE_NAMES)])
+            expected = "seven finite numbers, qw qx qy qz of length 1 and tx ty tz"
+            raise CaptureError(f"{path}, line {row['line']}: found the pose {found}; expected {expected}.")
     return rows
 
 
@@ -405,10 +375,8 @@ def _read_csv(path: Path, text: str) -> pd.DataFrame:
             header.pop()
         for values in reader:
             if any(value.strip() for value in values[len(header) :]):
-                raise CaptureError(
-                    f"{path}, line {reader.line_num}: found {len(values)} values, expected {len(header)}, as in the "
-                    "header. A value that contains a comma needs double quotes."
-                )
+                found = f"found {len(values)} values, expected {len(header)}, as in the header"
+                raise CaptureError(f"{path}, line {reader.line_num}: {found}. A comma in a value needs double quotes.")
             rows.append([*values[: len(header)], *[""] * (len(header) - len(values)), reader.line_num])
     except csv.Error as error:
         raise CaptureError(f"{path}, line {reader.line_num}: cannot be read as a CSV table ({error}).") from None

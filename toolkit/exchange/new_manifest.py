@@ -12,7 +12,7 @@ from toolkit.errors import ManifestError
 from toolkit.files import write_text
 
 TEMPLATE = Path(__file__).resolve().parents[2] / "data_manifests" / "my-capture.yaml"
-MOST_PROBLEMS = 10
+MAX_PROBLEMS = 10
 
 
 def new_manifest(name: str, capture: str | Path | None = None, folder: str | Path = "data_manifests") -> Path:
@@ -39,7 +39,7 @@ def new_manifest(name: str, capture: str | Path | None = None, folder: str | Pat
     if capture is None:
         head.append(f"# Name your capture below, then: python -m toolkit run {path}")
     else:
-        report = check_capture(capture).text(MOST_PROBLEMS)
+        report = check_capture(capture).text(MAX_PROBLEMS)
         head += [f"# Run it: python -m toolkit run {path}", "#", "# Result of `python -m toolkit check`:"]
         head += [f"# {line}".rstrip() for line in report.splitlines()]
         for prefix, new_line in _new_lines(Path(capture), path.parent).items():

@@ -33,15 +33,13 @@ FAILED = ("nearest", "leave-out")
 SCENES = {"HYDRO": "HYDRO", "SUCCULENT": "SUCCU"}
 """Captures of the CroCoDL challenge, with their names in its files; it asks for all pairs of `DEVICES`."""
 DEVICES = ["ios", "hl", "spot"]
-QUERIES = "keyframes_pruned_subsampled"
-"""The challenge's list of the query keyframes to be localized."""
-COUNTS = ["asked", "written", "ok", "low_confidence", "filled", "left_out", "not_asked"]
-NOTED = ["left_out", "filled", "not_asked"]
-"""Counts that make a pair incomplete."""
-ORIGINS = ["ok", "low_confidence", "nearest", "left out"]
-"""Where the pose of a query is from: the run, its nearest reference, or nowhere."""
-COLUMNS_OF_QUERIES = ["file", "timestamp", "device_id", "pose", "reason"]
+QUERIES = "keyframes_pruned_subsampled"  # the challenge's list of the query keyframes to be localized
+ORIGINS = {"ok": "ok", "low_confidence": "low_confidence", "nearest": "filled", "left out": "left_out"}
+"""Where the pose of a query is from (the run, its nearest reference, or nowhere), and the name of the counts."""
+COUNTS = ["asked", "written", *ORIGINS.values(), "not_asked"]
+NOTED = ["left_out", "filled", "not_asked"]  # counts that make a pair incomplete
 
+COLUMNS_OF_QUERIES = ["file", "timestamp", "device_id", "pose", "reason"]
 Key = tuple[int, str]
 
 
@@ -51,12 +49,9 @@ class Submission:
 
     path: Path
     description: str
-    poses: dict[str, Trajectory]
-    """The poses of each pair that has some, by the name of its file."""
-    queries: pd.DataFrame
-    """One row per query: file, timestamp, device_id, pose (of `ORIGINS`), reason."""
-    table: pd.DataFrame
-    """One row per pair: file, the numbers of queries `COUNTS`, state (`complete`, or what is missing)."""
+    poses: dict[str, Trajectory]  # the poses of each pair that has some, by the name of its file
+    queries: pd.DataFrame  # one row per query of `COLUMNS_OF_QUERIES`; `pose` is a key of `ORIGINS`
+    table: pd.DataFrame  # one row per pair: file, the numbers `COUNTS`, state (`complete`, or what is missing)
 
     @property
     def missing(self) -> list[str]:
@@ -133,7 +128,7 @@ def collect(
                     keyframes = capture_of(scene)[f"{pair[1]}_query"].keyframes(queries or QUERIES)
                     poses[name], table, not_asked = _answers(paths[path], pair, path, keyframes, failed)
                     tables.append(table.assign(file=name))
-                    of = table["pose"].value_counts().reindex(ORIGINS, fill_value=0).tolist()
+                    of = table["pose"].value_counts().reindex([*ORIGINS], fill_value=0).tolist()
                     counts = dict(zip(COUNTS, [len(table), len(poses[name]), *of, not_asked], strict=True))
                     notes = [f"{counts[key]} {key.replace('_', ' ')}" for key in NOTED if counts[key]]
                     state = ", ".join(notes) or "complete"
@@ -209,24 +204,23 @@ def _answers(
     if failed == "nearest" and np.any(rows < 0):
         require_current(files.poses_txt(*pair), "localize", (".jsonl",), missing=False)
         nearest, why_not = _nearest_references(files.retrieval(*pair))
-    qt = np.full((len(rows), 7), np.nan)
+    qt, answers = np.full((len(rows), 7), np.nan), list[tuple[str, str]]()
     qt[rows >= 0] = poses.qt[rows[rows >= 0]]
-    origins, reasons = list[str](), list[str]()
     for index, key in enumerate(zip(keyframes["timestamp"].tolist(), keyframes["device_id"], strict=True)):
         status = statuses.get(key, "no row in the run's table")
         if rows[index] >= 0:
             low = key in statuses and Status.parse(status)[0] is Status.LOW_CONFIDENCE
-            origin, reason = str(Status.LOW_CONFIDENCE if low else Status.OK), ""
+            answers.append((str(Status.LOW_CONFIDENCE if low else Status.OK), ""))
         elif key in nearest:
-            qt[index], origin, reason = qt_from_pose(nearest[key]), "nearest", status
+            qt[index] = qt_from_pose(nearest[key])
+            answers.append(("nearest", status))
         else:
-            origin, reason = "left out", f"{status}; {why_not}"
-        origins.append(origin)
-        reasons.append(reason)
+            answers.append(("left out", f"{status}; {why_not}"))
     posed = np.isfinite(qt).all(axis=1)
     qt[:, :4] = unit(qt[:, :4])
-    answers = Trajectory(keyframes["timestamp"][posed], keyframes["device_id"][posed], qt[posed])
-    return answers, keyframes.assign(pose=origins, reason=reasons), len(poses) - int(np.sum(rows >= 0))
+    written = Trajectory(keyframes["timestamp"][posed], keyframes["device_id"][posed], qt[posed])
+    table = keyframes.assign(pose=[pose for pose, _ in answers], reason=[reason for _, reason in answers])
+    return written, table, len(poses) - int(np.sum(rows >= 0))
 
 
 def _read_poses(path: Path) -> Trajectory:

@@ -34,20 +34,13 @@ from toolkit.geometry import Floats
 
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE = "OPENCV_FISHEYE"
-TOLERANCE = 1e-3
-"""Largest deviation of R^T R from the identity, per element, that still counts as a rotation."""
+TOLERANCE = 1e-3  # largest deviation of R^T R from the identity, per element, that still counts as a rotation
 
 
 def import_transforms(
-    path: str | Path,
-    capture: str | Path,
-    device: str = "ios",
-    split: str = "map",
-    placing: str = "link",
-    axes: str = "opengl",
-    unit_m: float | None = None,
-    hold_out: int = 0,
-) -> list[ImportReport]:
+    path: str | Path, capture: str | Path, device: str = "ios", split: str = "map", placing: str = "link",
+    axes: str = "opengl", unit_m: float | None = None, hold_out: int = 0,
+) -> list[ImportReport]:  # fmt: skip
     """Make a session, or a map and a query session, from a transforms.json. Images keep their `file_path` as names.
 
     Args:

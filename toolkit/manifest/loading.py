@@ -34,21 +34,15 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
     Raises:
         ManifestError: names the file (also the inherited one), the key, what was found, and the nearest known key.
     """
-    path = Path(path)
-    source = str(path)
+    path, overrides = Path(path), list(overrides)
+    source = " ".join([f"{path} with --set" if overrides else f"{path}", *overrides])
     chain = _read_chain(path, ())
-    raw: dict[str, Any] = {}
-    for _, content in chain:
+    # `output_root` is a path like any other.
+    raw: dict[str, Any] = {"name": path.stem, "output_root": Manifest.model_fields["output_root"].default}
+    for content in [*(content for _, content in chain), *map(_read_override, overrides)]:
         raw = merge(raw, expand(Manifest, content))
-    for override in overrides:
-        raw = merge(raw, expand(Manifest, _read_override(override)))
-        source = f"{path} with --set {override}" if source == str(path) else f"{source} {override}"
-    raw.setdefault("name", path.stem)
-    raw.setdefault("output_root", Manifest.model_fields["output_root"].default)  # a path like any other
-    folder = path.resolve().parent
+    raw = _map_paths(raw, lambda text, key: str(_expand(text, path.resolve().parent, f"{source}: {key}")))
     try:
-        Manifest.model_validate(raw)  # before paths are expanded, so that its errors come first
-        raw = _map_paths(raw, lambda text, key: str(_expand(text, folder, f"{source}: {key}")))
         manifest = Manifest.model_validate(raw)
     except ValidationError as error:
 
@@ -59,17 +53,12 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
 
         raise ManifestError(explain(error, Manifest, source, origin)) from None
     names = [Path(capture).name for capture in manifest.captures]
-    for name, capture in zip(names, manifest.captures, strict=True):
+    for name in names:
+        found = f"two folders called {name!r}, so their results would overwrite each other"
         if name in RUN_FILES:
-            raise ManifestError(
-                f"{source}: captures: the results of {capture} and the run's own {name} would have one path. Rename "
-                "the folder, or name a link to it."
-            )
-    if twice := {name for name in names if names.count(name) > 1}:
-        raise ManifestError(
-            f"{source}: captures: two folders are called {sorted(twice)[0]!r}, so their results would "
-            "overwrite each other. Rename one, or use two manifests."
-        )
+            found = f"a folder called {name!r}, as a file of the run itself"
+        if name in RUN_FILES or names.count(name) > 1:
+            raise ManifestError.at(f"{source}: captures", found, do="Rename one, or name a link to it.")
     return manifest
 
 
@@ -125,9 +114,7 @@ def _read_yaml(path: Path, heir: Path | None = None) -> dict[str, Any]:
     try:
         raw = _parse_yaml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        if heir:
-            raise ManifestError(f"{where}, and there is no such file. Correct `inherits`.") from None
-        raise ManifestError(f"{path}: no such manifest. data_manifests/demo.yaml is an example.") from None
+        raise ManifestError(f"{where}: no such manifest. data_manifests/demo.yaml is an example.") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ManifestError(f"{where}: cannot be read as a text file ({error}).") from None
     except yaml.YAMLError as error:
@@ -171,7 +158,7 @@ def _read_override(override: str) -> dict[str, Any]:
     """Return `section.key=value` as nested sections."""
     key, equals, text = override.partition("=")
     if not equals or not key.strip():
-        raise ManifestError(f"--set {override}: expected key=value, for example localize.method=nearest.")
+        raise ManifestError.at(f"--set {override}", expected="key=value, for example localize.method=nearest")
     try:
         value = _parse_yaml(text)
     except yaml.YAMLError as error:
@@ -195,10 +182,8 @@ def _has(content: Any, keys: list[str]) -> bool:
 def _expand(text: str, folder: Path, where: str) -> Path:
     expanded = os.path.expandvars(text)
     if unset := re.search(r"\$\{?(\w+)\}?", expanded):
-        raise ManifestError(
-            f"{where}: {text!r} uses the variable ${unset[1]}, which is not set. "
-            f"Set it (export {unset[1]}=...) or write the folder itself."
-        )
+        found = f"the variable ${unset[1]}, which is not set, in {text!r}"
+        raise ManifestError.at(where, found, do=f"Set it (export {unset[1]}=...) or write the folder itself.")
     try:
         path = Path(expanded).expanduser()
     except RuntimeError:

@@ -194,10 +194,8 @@ class Manifest(Settings):
     def _enough_references(self) -> Self:
         explicit = "topk" in self.retrieve.model_fields_set
         if self.rerank is not None and explicit and self.rerank.topn > self.retrieve.topk:
-            raise ValueError(
-                f"rerank.topn is {self.rerank.topn}, but retrieve.topk is only {self.retrieve.topk}: raise or remove "
-                "retrieve.topk"
-            )
+            found = f"rerank.topn is {self.rerank.topn}, but retrieve.topk is only {self.retrieve.topk}"
+            raise ValueError(f"{found}: raise or remove retrieve.topk")
         return self
 
     @model_validator(mode="after")

@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
@@ -112,7 +112,7 @@ def expand(model: type[Settings], raw: Mapping[str, Any]) -> dict[str, Any]:
                 value = {inner.shorthand: _plain(value)}
             elif value is True and model.model_fields[key].default is None:
                 value = {}  # switches an optional section on and keeps the keys of an inherited file
-            elif value is None and isinstance(model.model_fields[key].default, Settings):
+            elif value is None and type(None) not in get_args(model.model_fields[key].annotation):
                 value = {}  # a section without any key
         expanded[key] = _plain(value)
     return expanded
@@ -289,7 +289,7 @@ class FeaturesSettings(Settings):
     """Local features: which kinds, and how each is extracted."""
 
     shorthand = "kinds"
-    kinds: Annotated[list[str], Field(min_length=1)] = ["auto"]
+    kinds: Annotated[list[str], BeforeValidator(lambda kinds: [kinds] if isinstance(kinds, str) else kinds)] = ["auto"]
     """Kinds of local features: sift, superpoint, aliked; the matches of several kinds are pooled for one pose.
     auto: sift, with aliked as `escalation`; on a GPU both from the start; sift alone if ALIKED's weights are missing.
     `features: [sift]` is short for `features: {kinds: [sift]}`."""
@@ -306,17 +306,11 @@ class FeaturesSettings(Settings):
     aliked: AlikedSettings = AlikedSettings()
     """Settings of `aliked`."""
 
-    @model_validator(mode="before")
-    @classmethod
-    def _kinds_from_name(cls, raw: Any) -> Any:
-        """Take `features: sift` as `features: [sift]`."""
-        if isinstance(raw, dict) and isinstance(raw.get("kinds"), str):
-            return {**raw, "kinds": [raw["kinds"]]}
-        return raw
-
     @model_validator(mode="after")
     def _each_kind_once(self) -> Self:
         kinds = [*self.kinds, *self.escalation]
+        if not self.kinds:
+            raise ValueError("kinds is empty; expected at least one, such as sift")
         if AUTO in kinds and kinds != [AUTO]:
             raise ValueError(f"kinds is {self.kinds} and escalation {self.escalation}; {AUTO} cannot be combined")
         if len(set(kinds)) < len(kinds):

@@ -37,24 +37,17 @@ _ToMatch = tuple[str, str, int, int]
 """A pair to match: name of its item, fingerprint of the inputs of the matches, indices of the two images."""
 DEPTHS = (2.0, 4.0, 8.0, 16.0)
 """Depths at which the views of two images are compared, in map lengths (meters; see `Survey.length`)."""
-MAX_EPIPOLAR_ERROR_PX = 4.0
-"""Largest distance of a match from its epipolar line, on either side, pixels."""
-RATIO = 0.9
-"""Threshold of Lowe's ratio test among the candidates along the epipolar line."""
+MAX_EPIPOLAR_ERROR_PX = 4.0  # largest distance of a match from its epipolar line, on either side, pixels
+RATIO = 0.9  # threshold of Lowe's ratio test among the candidates along the epipolar line
 MAX_REFINEMENTS = 3  # rounds of bundle adjustment
 MIN_NOISE_PX = 1.0  # noise of the direction to points of the map, pixels, from which poses are refined
 NOISE_LIMIT = 4.0  # limits of a map whose poses are refined, in multiples of the noise of the direction to its points
-_MAP_FORMAT = 6
-"""Increase when the same settings give another file, so that existing maps are built again."""
+_MAP_FORMAT = 6  # increase when the same settings give another file, so that existing maps are built again
 
 
 def select_pairs(
-    world_from_cams: Floats,
-    cameras: Sequence[pycolmap.Camera],
-    groups: Ints,
-    per_image: int = 20,
-    length: float = 1.0,
-) -> Ints:
+    world_from_cams: Floats, cameras: Sequence[pycolmap.Camera], groups: Ints, per_image: int = 20, length: float = 1.0,
+) -> Ints:  # fmt: skip
     """Choose the image pairs of a map that are worth matching, from the poses alone.
 
     A pair is good if the cameras see the same part of the scene at an angle that triangulates well. The depth of the
@@ -113,14 +106,9 @@ def instants(session: Session, rows: Ints) -> Ints:
 
 
 def match_pairs(
-    pairs: Ints,
-    load: Callable[[int], LocalFeatures],
-    cameras: Sequence[pycolmap.Camera],
-    world_from_cams: Floats,
-    max_error_px: float = MAX_EPIPOLAR_ERROR_PX,
-    kind: FeatureKind = KINDS["sift"],
-    workers: int = 1,
-) -> Iterator[PairMatches]:
+    pairs: Ints, load: Callable[[int], LocalFeatures], cameras: Sequence[pycolmap.Camera], world_from_cams: Floats,
+    max_error_px: float = MAX_EPIPOLAR_ERROR_PX, kind: FeatureKind = KINDS["sift"], workers: int = 1,
+) -> Iterator[PairMatches]:  # fmt: skip
     """Match the features of image pairs with known poses along epipolar lines.
 
     Args:
@@ -180,17 +168,10 @@ def _kind_of(features: FeatureStore) -> FeatureKind:
 
 @fixed_sums
 def build_map(
-    session: Session,
-    features: FeatureStore,
-    path: str | Path,
-    settings: MapSettings | None = None,
-    seed: int = 0,
-    skip_existing: bool = True,
-    inputs: str = "",
-    workers: int = 1,
-    metric: bool = True,
+    session: Session, features: FeatureStore, path: str | Path, settings: MapSettings | None = None, seed: int = 0,
+    skip_existing: bool = True, inputs: str = "", workers: int = 1, metric: bool = True,
     poses: Mapping[str, Floats] | None = None,
-) -> LocalMap:
+) -> LocalMap:  # fmt: skip
     """Triangulate the map of a session with its known poses, or open the one at `path` if it is current.
 
     A map of more than `settings.tile_images` images is built in tiles. Matches and tiles are stored beside it, so a
@@ -239,7 +220,7 @@ def _refined(given: "MapPlan", workers: int) -> "MapPlan":
     plan, depth = given, given.survey.typical_depth() / given.length
     focal_px = float(np.median([camera.mean_focal_length() for camera in given.cameras]))
     for _ in range(MAX_REFINEMENTS):
-        noise = plan.survey.noise(plan.length)
+        noise = plan.survey.pairs.noise(plan.length)
         noise_px = np.radians(noise.direction_deg(depth)) * focal_px
         if plan is given and noise_px < MIN_NOISE_PX:
             break
@@ -265,33 +246,24 @@ class MapPlan(Remade):
     """The work of building a map: its images, the pairs to match, and the tiles to triangulate."""
 
     def __init__(
-        self,
-        session: Session,
-        features: FeatureStore,
-        path: Path,
-        settings: MapSettings,
-        seed: int = 0,
-        metric: bool = True,
-        length: float | None = None,
-        poses: Mapping[str, Floats] | None = None,
-        least_limit_px: float = 0.0,
-    ):
+        self, session: Session, features: FeatureStore, path: Path, settings: MapSettings, seed: int = 0,
+        metric: bool = True, length: float | None = None, poses: Mapping[str, Floats] | None = None,
+        min_limit_px: float = 0.0,
+    ):  # fmt: skip
         """See `build_map`; `length` is the survey's length if it is known, which saves the survey.
 
-        Limits of errors in pixels are at least `least_limit_px`.
+        Limits of errors in pixels are at least `min_limit_px`.
         """
         self.session, self.features, self.path, self.settings, self.seed = session, features, path, settings, seed
         names, world_from_cams = session.image_names, session.world_from_cam()
-        self._poses, self._least_limit_px = poses, least_limit_px
+        self._poses, self._min_limit_px = poses, min_limit_px
         for name, pose in (poses or {}).items():
             world_from_cams[session.row_of_name[name]] = pose
         posed = np.isfinite(world_from_cams).reshape(-1, 16).all(axis=1)
         self.rows = np.flatnonzero(posed & np.array([name in features for name in names], bool))
         """(N,) rows of the map images in the session."""
         if not len(self.rows):
-            raise ArtifactError(
-                f"Session {session.id} has no image with both a pose and local features: no map can be built."
-            )
+            raise ArtifactError(f"{session.id} has no image with a pose and local features: no map can be built.")
         self.world_from_cams = world_from_cams[self.rows]
         self.names = [names[row] for row in self.rows]
         self.cameras = session.cameras(self.rows)
@@ -306,43 +278,31 @@ class MapPlan(Remade):
         starts = np.searchsorted(self._home[self.pairs[order, 0]], np.arange(len(self.tiles) + 1))
         self.pairs_of = [self.pairs[np.sort(order[slice(*starts[tile : tile + 2])])] for tile in range(len(self.tiles))]
         """For each tile, the pairs whose first image is in its core."""
-        # What was just matched is not read again. Only for a map of one tile: those of several may not fit into memory.
-        self._matched: dict[tuple[int, int], Ints] = {}
-        self._keypoints_of: dict[int, NDArray[np.float32]] = {}
-        self.matcher = _matcher_settings(self.kind, max(MAX_EPIPOLAR_ERROR_PX, least_limit_px))
+        self.keypoints = lru_cache(maxsize=512)(lambda image: self._features_of(image).keypoints)
+        self.matcher = _matcher_settings(self.kind, max(MAX_EPIPOLAR_ERROR_PX, min_limit_px))
 
     @cached_property
     def survey(self) -> Survey:
         """Survey of the poses, from a sample of image pairs."""
         rig_from_cams = self.session.rig_from_cam(self.rows)
-        surveyed = SurveyedImages(
-            self.names,
-            self.cameras,
-            self.world_from_cams @ geometry.invert(rig_from_cams),
-            rig_from_cams,
-            self.groups,
-            self.session.images["sensor_id"].to_numpy()[self.rows].tolist(),
-        )
-        return Survey(surveyed, lambda index: self.features[self.names[index]], self.kind)
+        world_from_rigs = self.world_from_cams @ geometry.invert(rig_from_cams)
+        sensors = self.session.images["sensor_id"].to_numpy()[self.rows].tolist()
+        images = SurveyedImages(self.names, self.cameras, world_from_rigs, rig_from_cams, self.groups, sensors)
+        return Survey(images, self._features_of, self.kind)
 
     @cached_property
     def of_worker(self) -> Any:
         """This plan for a worker, which gets the length and so needs no survey."""
-        arguments = (self.session, self.features, self.path, self.settings, self.seed)
-        more = {"length": self.length, "poses": self._poses, "least_limit_px": self._least_limit_px}
-        return MapPlan.elsewhere(*arguments, **more)
+        more = {"length": self.length, "poses": self._poses, "min_limit_px": self._min_limit_px}
+        return MapPlan.elsewhere(self.session, self.features, self.path, self.settings, self.seed, **more)
 
     def with_poses(
-        self, world_from_cams: Floats, path: Path, settings: MapSettings, least_limit_px: float = 0.0
+        self, world_from_cams: Floats, path: Path, settings: MapSettings, min_limit_px: float = 0.0
     ) -> "MapPlan":
         """Return the plan of the same map with other poses (N, 4, 4) of its images, file and settings."""
-        poses = dict(zip(self.names, world_from_cams, strict=True))
-        plan = MapPlan(
-            *(self.session, self.features, path, settings, self.seed),
-            length=self.length,
-            poses=poses,
-            least_limit_px=least_limit_px,
-        )
+        more: dict[str, Any] = {"length": self.length, "min_limit_px": min_limit_px}
+        more["poses"] = dict(zip(self.names, world_from_cams, strict=True))
+        plan = MapPlan(self.session, self.features, path, settings, self.seed, **more)
         plan.survey = self.survey.with_poses(world_from_cams)
         return plan
 
@@ -368,33 +328,16 @@ class MapPlan(Remade):
             todo = items.left((match_name(names[i], names[j]), made_from[i] + made_from[j], i, j) for i, j in pairs)
             label = f"match {self.session.id}" + (f" {number + 1}/{len(self.tiles)}" if len(self.tiles) > 1 else "")
             todo = items.spread(_match_share, todo, (self.of_worker,), label, "pair")
-            self.match_into(items, todo, workers, label if todo else "", keep=len(self.tiles) == 1)
+            self.match_into(items, todo, workers, label if todo else "")
 
-    def match_into(
-        self, items: Items, todo: Sequence[_ToMatch], workers: int, label: str, keep: bool = False
-    ) -> None:
-        """Add the matches of pairs to a folder; `keep` them in memory, too."""
-
-        def load(index: int) -> LocalFeatures:
-            features = self.features[self.names[index]]
-            if keep:
-                self._keypoints_of[index] = features.keypoints
-            return features
-
-        all_matches = match_pairs(
-            np.array([pair[2:] for pair in todo], np.int64).reshape(-1, 2),
-            load,
-            self.cameras,
-            self.world_from_cams,
-            self.matcher["max_error_px"],
-            self.kind,
-            workers,
-        )
-        bar = tqdm(all_matches, total=len(todo), desc=label, unit="pair", disable=not label)
-        for (name, source, i, j), matches in zip(todo, bar, strict=True):
-            write_matches(items, name, source, matches)
-            if keep:
-                self._matched[i, j] = matches.indices
+    def match_into(self, items: Items, todo: Sequence[_ToMatch], workers: int, label: str) -> None:
+        """Add the matches of pairs to a folder."""
+        pairs = np.array([pair[2:] for pair in todo], np.int64).reshape(-1, 2)
+        poses, max_error_px = self.world_from_cams, self.matcher["max_error_px"]
+        matches = match_pairs(pairs, self._features_of, self.cameras, poses, max_error_px, self.kind, workers)
+        bar = tqdm(matches, total=len(todo), desc=label, unit="pair", disable=not label)
+        for (name, source, _, _), matched in zip(todo, bar, strict=True):
+            write_matches(items, name, source, matched)
 
     def tile_path(self, number: int) -> Path:
         """Return the file of a tile, which is a map of its own."""
@@ -428,11 +371,6 @@ class MapPlan(Remade):
         pairs = self._pairs_in(number)
         stores = {tile: MatchStore(self._matches_path(tile)) for tile in np.unique(self._home[images]).tolist()}
 
-        def matches_of(i: int, j: int) -> Ints:
-            if (i, j) in self._matched:
-                return self._matched[i, j]
-            return stores[self._home[i]][self.names[i], self.names[j]].indices
-
         poses = self.world_from_cams[images]
         # In the unit of the poses: divided by the length, a shift by whole hundreds would no longer be one.
         origin = geometry.local_origin(self.world_from_cams[:, :3, 3])
@@ -442,10 +380,10 @@ class MapPlan(Remade):
             geometry.make_pose(poses[:, :3, :3], (poses[:, :3, 3] - origin) / self.length),
             [self.keypoints(image) for image in images],
             np.searchsorted(images, pairs),
-            [matches_of(i, j) for i, j in pairs.tolist()],
+            [stores[self._home[i]][self.names[i], self.names[j]].indices for i, j in pairs.tolist()],
             self.settings,
             self.seed,
-            max(MAX_REPROJECTION_ERROR_PX, self._least_limit_px),
+            max(MAX_REPROJECTION_ERROR_PX, self._min_limit_px),
         ).scaled(self.length)
         points = local_map.points + origin
         local_map = replace(local_map, world_from_cams=poses, points=points, length=self.length)
@@ -476,9 +414,8 @@ class MapPlan(Remade):
     def _save(self, local_map: LocalMap) -> None:
         local_map.judged(self.survey.consistency(local_map)).save(self.path)
 
-    def keypoints(self, image: int) -> NDArray[np.float32]:
-        kept = self._keypoints_of.get(image)
-        return self.features[self.names[image]].keypoints if kept is None else kept
+    def _features_of(self, image: int) -> LocalFeatures:
+        return self.features[self.names[image]]
 
     def _colors(self, images: Ints, keypoints: Ints) -> NDArray[np.uint8]:
         """Return the colors (n, 3) at n keypoints of images; gray where an image cannot be read."""

@@ -26,38 +26,26 @@ ORDERS = ("image_starts", "by_point", "point_starts")
 """Arrays of a map file: fields of `LocalMap`, and sorting orders, which would take the whole map to compute."""
 IN_MEMORY = 1 << 26
 """Largest map file in bytes that is read when it is opened, so that it can be overwritten. Larger ones are mapped."""
-_BLOCK = 1 << 18
-"""Number of points processed at once."""
+_BLOCK = 1 << 18  # number of points processed at once
 OPENGL_AXES = "camera axes as in OpenGL (x right, y up, z backward)"
 """A convention that may fit an inconsistent map. It also fits poses whose axes were converted but should not have."""
-_PADDING = 0xD935
-"""Header ID of a zip extra field that readers ignore, as `zipalign` uses it."""
+_PADDING = 0xD935  # header ID of a zip extra field that readers ignore, as `zipalign` uses it
 
 
 @dataclass(frozen=True)
 class Consistency:
     """How well the poses of a map agree with its images."""
 
-    verdict: str = "unknown"
-    """`consistent`, `inconsistent`, or `unknown` if there are too few matches to tell."""
-    pairs: int = 0
-    """Number of image pairs whose matches were verified without poses."""
-    agreeing: int = 0
-    """Number of these pairs whose matches agree with the poses."""
-    fits: str = ""
-    """For an inconsistent map, the convention with which the poses would agree; empty if none of those tried fits."""
-    seen_by_three: float = 0.0
-    """Share of the points that at least three images observe."""
-    wrong: list[str] = field(default_factory=list)
-    """Images whose poses contradict those of the other images."""
-    camera: str = ""
-    """For a map whose intrinsics do not fit its images, those that would fit."""
-    rotation_noise_deg: float = 0.0
-    """Standard deviation of the noise of the poses, per axis."""
-    position_noise: float = 0.0
-    """In map lengths, see `LocalMap.length`, per axis."""
-    direction_noise_deg: float = 0.0
-    """Standard deviation of the direction to a point at the median depth, due to the noise of a pose, per axis."""
+    verdict: str = "unknown"  # `consistent`, `inconsistent`, or `unknown` if there are too few matches to tell
+    pairs: int = 0  # number of image pairs whose matches were verified without poses
+    agreeing: int = 0  # number of these pairs whose matches agree with the poses
+    fits: str = ""  # for an inconsistent map, the convention with which the poses would agree; empty if none was found
+    seen_by_three: float = 0.0  # share of the points that at least three images observe
+    wrong: list[str] = field(default_factory=list)  # images whose poses contradict those of the other images
+    camera: str = ""  # for a map whose intrinsics do not fit its images, those that would fit
+    rotation_noise_deg: float = 0.0  # standard deviation of the noise of the poses, per axis
+    position_noise: float = 0.0  # in map lengths, see `LocalMap.length`, per axis
+    direction_noise_deg: float = 0.0  # of the direction to a point at the median depth, due to both, per axis
 
     @property
     def trusted(self) -> bool:
@@ -73,21 +61,17 @@ class Consistency:
             )  # fmt: skip
             if OPENGL_AXES in self.fits:
                 cause += " If imported: give the other `--axes`, opencv or opengl, to `python -m toolkit import`."
-            return (
-                f"the poses of the map contradict its images: {self.agreeing} of {self.pairs} image pairs with "
-                f"verified matches agree with the poses. {cause}"
-            )
+            agree = f"{self.agreeing} of {self.pairs} image pairs with verified matches agree with the poses"
+            return f"the poses of the map contradict its images: {agree}. {cause}"
         if self.camera:
             return f"the intrinsics of the map contradict its images: {self.camera}. Correct them and localize again"
         if self.wrong:
             names = ", ".join(self.wrong[:8]) + (f" and {len(self.wrong) - 8} more" if len(self.wrong) > 8 else "")
             return f"{len(self.wrong)} map images have poses that contradict the others: {names}"
         if self.verdict == "unknown":
-            agree = f", {self.agreeing} of which agree with them" if self.pairs else ""
-            return (
-                "too few matches to tell whether the poses of the map are right "
-                f"({self.pairs} verified image pairs{agree})"
-            )
+            found = f"{self.pairs} verified image pairs"
+            found += f", {self.agreeing} of which agree with them" if self.pairs else ""
+            return f"too few matches to tell whether the poses of the map are right ({found})"
         return ""
 
 
@@ -99,23 +83,16 @@ class LocalMap:
     point `obs_point[o]`. The arrays of a large map stay in its file and are read only where they are used.
     """
 
-    image_names: list[str]
-    """N names (`Session.image_name`)."""
-    cameras: list[pycolmap.Camera]
-    """N cameras, with distortion, as in the capture."""
-    world_from_cams: Floats
-    """(N, 4, 4)."""
-    points: Floats
-    """(P, 3) in the world, meters."""
-    colors: NDArray[np.uint8]
-    """(P, 3) RGB."""
+    image_names: list[str]  # N names (`Session.image_name`)
+    cameras: list[pycolmap.Camera]  # N cameras, with distortion, as in the capture
+    world_from_cams: Floats  # (N, 4, 4)
+    points: Floats  # (P, 3) in the world, meters
+    colors: NDArray[np.uint8]  # (P, 3) RGB
     obs_image: Ints
     obs_keypoint: Ints
     obs_point: Ints
-    noise_px: NDArray[np.float32]
-    """(P,) standard deviation of each point's observations per axis; equal for all points of one kind of features."""
-    length: float = 1.0
-    """The length that localizers treat as one meter, in the unit of the poses; see `Survey.length`."""
+    noise_px: NDArray[np.float32]  # (P,) standard deviation of a point's observations per axis; equal for one kind
+    length: float = 1.0  # the length that localizers treat as one meter, in the unit of the poses; see `Survey.length`
     consistency: Consistency = field(default_factory=Consistency)
 
     @cached_property
@@ -259,19 +236,10 @@ class LocalMap:
         image = np.concatenate(images)
         point = np.concatenate([one.obs_point + start for one, start in zip(maps, starts[:-1], strict=True)])
         order = np.argsort(image, kind="stable")
-        pooled = cls(
-            image_names=names,
-            cameras=cameras,
-            world_from_cams=poses,
-            points=np.concatenate([one.points for one in maps]),
-            colors=np.concatenate([one.colors for one in maps]),
-            obs_image=image[order],
-            obs_keypoint=np.concatenate([one.obs_keypoint for one in maps])[order],
-            obs_point=point[order],
-            noise_px=np.concatenate([one.noise_px for one in maps]),
-            length=first.length,
-            consistency=first.consistency,
-        )
+        names_of = ("points", "colors", "obs_keypoint", "noise_px")
+        joined = {name: np.concatenate([getattr(one, name) for one in maps]) for name in names_of}
+        joined |= {"obs_image": image[order], "obs_keypoint": joined["obs_keypoint"][order], "obs_point": point[order]}
+        pooled = replace(first, image_names=names, cameras=cameras, world_from_cams=poses, **joined)
         return pooled._sharing(first) if same else pooled
 
     def judged(self, consistency: Consistency) -> "LocalMap":
@@ -329,9 +297,7 @@ class LocalMap:
                 **{name: arrays[name] for name in _ARRAYS},
             ).knowing(**{name: arrays[name] for name in ORDERS})
         except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile, struct.error) as error:
-            raise ArtifactError(
-                f"The triangulated map {path} cannot be read ({error}). Build it again with the localize stage."
-            ) from None
+            raise ArtifactError(f"The map {path} cannot be read ({error}). Run the localize stage again.") from None
         return opened
 
 

@@ -8,7 +8,7 @@ mirrored axes of the cameras or of the positions, another order of the quaternio
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import permutations, product
 from typing import NamedTuple
 
@@ -27,41 +27,30 @@ from toolkit.features.verification import verified_matches
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import RerankSettings
 from toolkit.mapping.local_map import OPENGL_AXES, Consistency, LocalMap
-from toolkit.mapping.pose_noise import PoseNoise, SurveyedPairs, VerifiedPair
+from toolkit.mapping.pose_noise import SurveyedPairs, VerifiedPair
 from toolkit.threads import fixed_sums
 
-ANCHORS = 12
-"""Number of images, evenly spread over the map, that are matched with their neighbors."""
-MAX_FEATURES = 1024
-"""Number of features that are matched per image, the strongest ones."""
-LEAST_MATCHES = 24
+ANCHORS = 12  # number of images, evenly spread over the map, that are matched with their neighbors
+MAX_FEATURES = 1024  # number of features that are matched per image, the strongest ones
+MIN_MATCHES = 24
 """Fewest verified matches of a pair that counts; few pairs of different places that look alike have as many."""
-LEAST_PAIRS = 5
-"""Fewest verified pairs for a verdict on a map."""
+MIN_PAIRS = 5  # fewest verified pairs for a verdict on a map
 MAX_ERROR_DEG = 1.0
 """Largest median angle between the rays of a pair's matches and their epipolar planes. Good poses have some hundredths
 of a degree, poses in another convention tens of degrees."""
-LEAST_PARALLAX_DEG = 0.5
-"""Least angle between two rays that tells whether their point is in front of the cameras."""
+MIN_PARALLAX_DEG = 0.5  # least angle between two rays that tells whether their point is in front of the cameras
 MAX_ROTATION_ERROR_DEG = 5.0
 """Largest median difference between the relative rotations of poses and matches under a convention that fits."""
-MOST_TRIED = 12
-"""Number of pairs that conventions are tried with, those with the most matches."""
-CLEAR = 0.75
-"""Share of agreeing pairs from which no further convention is tried."""
-COARSE_DEG = 3.0
-"""Largest median error of correct but coarse poses."""
-COARSE_ROTATION_DEG = 10.0
-"""Largest median error of their relative rotations."""
+MAX_TRIED = 12  # number of pairs that conventions are tried with, those with the most matches
+CLEAR = 0.75  # share of agreeing pairs from which no further convention is tried
+COARSE_DEG = 3.0  # largest median error of correct but coarse poses
+COARSE_ROTATION_DEG = 10.0  # largest median error of their relative rotations
 NOISE = 20.0
 """Error of an image, in multiples of the median error, from which its pose is wrong; but at least 0.3 degrees."""
-WEAK = 0.3
-"""Images with less than this share of the median number of shared points are checked individually."""
-MOST_WEAK = 8
-"""Largest number of images that are checked individually, so that the effort does not grow with the map."""
+WEAK = 0.3  # images with less than this share of the median number of shared points are checked individually
+MAX_WEAK = 8  # largest number of images that are checked individually, so that the effort does not grow with the map
 
-NOMINAL_DEPTH = 10.0
-"""Median depth to which a map with poses of unknown unit is scaled for the localizers."""
+NOMINAL_DEPTH = 10.0  # median depth to which a map with poses of unknown unit is scaled for the localizers
 USUAL_DEPTHS_M = (2.0, 16.0)
 """Range of median depths for which the limits of the localizers, in meters, apply unchanged."""
 
@@ -71,14 +60,10 @@ class SurveyedImages(NamedTuple):
 
     names: Sequence[str]
     cameras: Sequence[pycolmap.Camera]
-    world_from_rigs: Floats
-    """(N, 4, 4)"""
-    rig_from_cams: Floats
-    """(N, 4, 4)"""
-    instants: Ints
-    """(N,) number of the instant; images that a rig took at the same time share it."""
-    sensors: Sequence[str]
-    """(N,) sensor ids."""
+    world_from_rigs: Floats  # (N, 4, 4)
+    rig_from_cams: Floats  # (N, 4, 4)
+    instants: Ints  # (N,) number of the instant; images that a rig took at the same time share it
+    sensors: Sequence[str]  # (N,) sensor ids
 
     @property
     def world_from_cams(self) -> Floats:
@@ -100,8 +85,7 @@ class Survey:
         self._matcher = MutualMatcher.of(kind)
         self._load = lru_cache(maxsize=64)(lambda index: load(index).take(slice(MAX_FEATURES)))
         self._verified = lru_cache(maxsize=None)(self._verify)
-        self.sample = self.verify(_sampled_pairs(images))
-        """Verified pairs all over the map."""
+        self.sample = self.verify(_sampled_pairs(images))  # verified pairs all over the map
 
     def verify(self, pairs: Iterable[tuple[int, int]]) -> list[VerifiedPair]:
         """Return the covisible ones of pairs of images, by their matches alone."""
@@ -115,7 +99,7 @@ class Survey:
         cameras = self.images.cameras
         xy = a.keypoints[matches.indices[:, 0]], b.keypoints[matches.indices[:, 1]]
         kept, _, essential = verified_matches(cameras[i], xy[0], cameras[j], xy[1], matches.scores, RerankSettings())
-        if len(kept) < LEAST_MATCHES:
+        if len(kept) < MIN_MATCHES:
             return None
         rays = rays_of(cameras[i], xy[0][kept]), rays_of(cameras[j], xy[1][kept])
         plane_i, plane_j = (np.ascontiguousarray(r[:, :2] / r[:, 2:]) for r in rays)
@@ -128,10 +112,10 @@ class Survey:
         per_pair = [np.zeros(0)]
         for pair in self.sample:
             error_deg, depth_i, depth_j, parallax_deg = _compare(pair, _relative(poses, pair))
-            good = (error_deg < MAX_ERROR_DEG) & (parallax_deg > 2 * LEAST_PARALLAX_DEG) & (depth_i > 0) & (depth_j > 0)
+            good = (error_deg < MAX_ERROR_DEG) & (parallax_deg > 2 * MIN_PARALLAX_DEG) & (depth_i > 0) & (depth_j > 0)
             per_pair += [depth_i[good], depth_j[good]]
         depths = np.concatenate(per_pair)
-        return float(np.median(depths)) if len(depths) >= LEAST_MATCHES else float("nan")
+        return float(np.median(depths)) if len(depths) >= MIN_MATCHES else float("nan")
 
     def length(self, metric: bool) -> float:
         """Return the length, in the unit of the poses, that localizers should treat as one meter.
@@ -158,7 +142,7 @@ class Survey:
         three = float((lengths >= 3).mean()) if len(lengths) else 0.0
         agree = _agreeing(self.images.world_from_cams, self.sample)
         result = Consistency(pairs=len(agree), agreeing=int(agree.sum()), seen_by_three=round(three, 4))
-        if len(agree) < LEAST_PAIRS:
+        if len(agree) < MIN_PAIRS:
             return result
         share = float(agree.mean())
         if share < CLEAR:
@@ -170,7 +154,7 @@ class Survey:
             )
             if fits or (share < 0.5 and too_coarse):
                 return replace(result, verdict="inconsistent", fits=fits)
-        pairs = self._pairs
+        pairs = self.pairs
         noise = pairs.noise(local_map.length)
         return replace(
             result,
@@ -183,12 +167,9 @@ class Survey:
         )
 
     @property
-    def _pairs(self) -> SurveyedPairs:
+    def pairs(self) -> SurveyedPairs:
+        """The sample with the poses of its images, for their noise and the intrinsics."""
         return SurveyedPairs(self.sample, self.images.world_from_cams)
-
-    def noise(self, length: float) -> PoseNoise:
-        """Return the noise of the poses; see `SurveyedPairs.noise`."""
-        return self._pairs.noise(length)
 
     def with_poses(self, world_from_cams: Floats) -> "Survey":
         """Return this survey of the same matches for other poses (N, 4, 4)."""
@@ -214,7 +195,7 @@ class Survey:
         poses = self.images.world_from_cams
         support = local_map.images_seeing(np.flatnonzero(np.diff(local_map.point_starts) >= 3))
         weak = np.flatnonzero(support < WEAK * np.median(support))
-        suspects = weak[np.argsort(support[weak], kind="stable")][:MOST_WEAK].tolist()
+        suspects = weak[np.argsort(support[weak], kind="stable")][:MAX_WEAK].tolist()
         pairs = self.verify((index, other) for index in suspects for other in self._candidates(index))
         usual_deg = float(np.median(self._errors_deg(self.sample)))
         agree = _agreeing(poses, pairs, float(np.clip(NOISE * usual_deg, 0.3, MAX_ERROR_DEG)))
@@ -228,7 +209,7 @@ class Survey:
                 own = [(count, good) for i, j, count, good in votes if index in (i, j) and not {i, j} & wrong]
                 against = [count for count, good in own if not good]
                 in_favor = sum(count for count, good in own if good)
-                if len(against) >= 2 and sum(against) > max(4 * in_favor, 4 * LEAST_MATCHES):
+                if len(against) >= 2 and sum(against) > max(4 * in_favor, 4 * MIN_MATCHES):
                     balance[index] = sum(against) - in_favor
             if not balance:
                 return sorted(self.images.names[index] for index in wrong)
@@ -302,21 +283,10 @@ def _agreeing(
     agree = np.zeros(len(pairs), bool)
     for index, pair in enumerate(pairs):
         error_deg, depth_i, depth_j, parallax_deg = _compare(pair, _relative(world_from_cams, pair))
-        telling = parallax_deg > LEAST_PARALLAX_DEG
+        telling = parallax_deg > MIN_PARALLAX_DEG
         behind = telling & ((depth_i <= 0) | (depth_j <= 0))
         agree[index] = np.median(error_deg) < max_error_deg and 2 * behind.sum() <= telling.sum()
     return agree
-
-
-class _Convention(NamedTuple):
-    """A convention that a file of poses may follow."""
-
-    mistakes: float
-    """Number of differences from the expected convention."""
-    text: str
-    """Description of the differences."""
-    poses: Callable[[], Floats]
-    """Returns world_from_cams (N, 4, 4) under this convention."""
 
 
 def _fitting_convention(images: SurveyedImages, pairs: Sequence[VerifiedPair], share_given: float) -> str:
@@ -324,63 +294,66 @@ def _fitting_convention(images: SurveyedImages, pairs: Sequence[VerifiedPair], s
 
     The share of agreeing pairs must clearly exceed `share_given`, that of the poses as they are.
     """
-    pairs = sorted(pairs, key=lambda pair: -len(pair.rays_i))[:MOST_TRIED]  # a few pairs are enough
+    pairs = sorted(pairs, key=lambda pair: -len(pair.rays_i))[:MAX_TRIED]  # a few pairs are enough
+    used, ends = np.unique([(pair.i, pair.j) for pair in pairs], return_inverse=True)
+    ends = ends.reshape(-1, 2)
+    pairs = [pair._replace(i=i, j=j) for pair, (i, j) in zip(pairs, ends.tolist(), strict=True)]
+    matched = np.stack([pair.j_from_i[:3, :3] for pair in pairs])
+    conventions = _conventions(images.world_from_rigs[used], images.rig_from_cams[used], ends, matched)
     best = (max(0.5, share_given + 0.25), "")
-    for convention in sorted(_conventions(images, pairs), key=lambda convention: convention.mistakes):
-        share = float(_agreeing(convention.poses(), pairs).mean())
+    for _, text, world_from_cams in sorted(conventions, key=lambda convention: convention[0]):
+        share = float(_agreeing(world_from_cams, pairs).mean())
         if share > best[0]:
-            best = share, convention.text
+            best = share, text
         if share >= CLEAR and best[1]:
             break
     return best[1]
 
 
-def _conventions(images: SurveyedImages, pairs: Sequence[VerifiedPair]) -> Iterator[_Convention]:
-    """Yield the conventions under which the relative rotations of pairs agree with those of their matches."""
-    i, j = (np.array(ends) for ends in zip(*((pair.i, pair.j) for pair in pairs), strict=True))
-    matched = np.stack([pair.j_from_i[:3, :3] for pair in pairs])
-    stated, positions = images.world_from_rigs[:, :3, :3], images.world_from_rigs[:, :3, 3]
+def _conventions(
+    world_from_rigs: Floats, rig_from_cams: Floats, pairs: Ints, matched: Floats
+) -> Iterator[tuple[float, str, Floats]]:
+    """Yield the conventions under which the relative rotations of pairs (P, 2) agree with those of their matches.
+
+    Each has the number of its differences from the expected one, their description, and world_from_cams (N, 4, 4).
+
+    Args:
+        world_from_rigs, rig_from_cams: as given, (N, 4, 4).
+        matched: j_from_i of the pairs, (P, 3, 3).
+    """
+    (i, j), stated, positions = pairs.T, world_from_rigs[:, :3, :3], world_from_rigs[:, :3, 3]
     reordered = geometry.quaternion_to_rotation(np.roll(geometry.rotation_to_quaternion(stated), 1, axis=-1))
-    rigs = [("", images.rig_from_cams)]
-    if not np.allclose(images.rig_from_cams, np.eye(4)):
-        rigs.append(("rigs as sensor_from_rig", geometry.invert(images.rig_from_cams)))
-    signed_axes = [
-        np.diag(signs) @ np.eye(3)[list(order)]
-        for order in permutations(range(3))
-        for signs in product((1, -1), repeat=3)
-    ]
-    for order, inverse, X, (rigs_text, rig_from_cams) in product((0, 1), (0, 1), signed_axes, rigs):
+    all_rigs = [("", rig_from_cams)]
+    if not np.allclose(rig_from_cams, np.eye(4)):
+        all_rigs.append(("rigs as sensor_from_rig", geometry.invert(rig_from_cams)))
+    signs = [np.diag(signs) for signs in product((1, -1), repeat=3)]
+    signed_axes = [sign @ np.eye(3)[list(order)] for order in permutations(range(3)) for sign in signs]
+    for order, inverse, X, (rigs_text, rigs) in product((0, 1), (0, 1), signed_axes, all_rigs):
         if np.linalg.det(X) < 0:
             continue
         R = (stated, reordered)[order]
         R = np.swapaxes(R, 1, 2) if inverse else R
-        world_from_cams = R @ X @ rig_from_cams[:, :3, :3]
+        world_from_cams = R @ X @ rigs[:, :3, :3]
         j_from_i = np.swapaxes(world_from_cams[j], 1, 2) @ world_from_cams[i]
         if np.median(geometry.rotation_angle_deg(np.swapaxes(j_from_i, 1, 2) @ matched)) > MAX_ROTATION_ERROR_DEG:
             continue
         # The stated position is the camera center, or the translation of cam_from_world.
         for translations, A in product((0, 1), signed_axes):
             centers = -(R @ positions[..., None])[..., 0] if translations else positions
-            direction = ["", "translations", "rotations", "poses"][2 * inverse + translations]
-            texts = [f"{direction} of cam_from_world" if direction else "", rigs_text]
-            texts.append("quaternions in the order x, y, z, w" if order else "")
             # Mirroring world and cameras along one axis gives rotations about other axes, and negated positions.
             mirrored = np.trace(X) == -1 and np.array_equal(X, np.diag(np.diag(X))) and np.array_equal(A, -np.eye(3))
-            texts.append("a mirrored world" if mirrored else _axes_text(X))
-            flipped = "mirrored" if np.linalg.det(A) < 0 else "other"
-            same = mirrored or np.array_equal(A, np.eye(3))
-            texts.append("" if same else f"{flipped} axes of the places ({_axes(A.T)})")
+            moved = not mirrored and not np.array_equal(A, np.eye(3))
+            direction = ("", "translations", "rotations", "poses")[2 * inverse + translations]
+            texts = [
+                f"{direction} of cam_from_world" if direction else "",
+                rigs_text,
+                "quaternions in the order x, y, z, w" if order else "",
+                "a mirrored world" if mirrored else _axes_text(X),
+                f"{'mirrored' if np.linalg.det(A) < 0 else 'other'} axes of the places ({_axes(A.T)})" if moved else "",
+            ]
             texts = [text for text in texts if text]
-            yield _Convention(
-                len(texts) + 0.5 * order + 0.5 * (not same) + 0.5 * (direction in ("translations", "rotations")),
-                ", ".join(texts),
-                partial(_poses, R @ X, centers @ A.T, rig_from_cams),
-            )
-
-
-def _poses(rotations: Floats, centers: Floats, rig_from_cams: Floats) -> Floats:
-    """Return world_from_cams (N, 4, 4)."""
-    return geometry.make_pose(rotations, centers) @ rig_from_cams
+            mistakes = len(texts) + 0.5 * (order + moved + (inverse != translations))
+            yield mistakes, ", ".join(texts), geometry.make_pose(R @ X, centers @ A.T) @ rigs
 
 
 def _axes_text(axes: Floats) -> str:

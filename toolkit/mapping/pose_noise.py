@@ -38,20 +38,16 @@ class VerifiedPair(NamedTuple):
 
     i: int
     j: int
-    rays_i: Floats
-    """(K, 3) unit rays in the frame of camera i."""
-    rays_j: Floats
-    """(K, 3) unit rays in the frame of camera j."""
-    j_from_i: Floats
-    """(4, 4) relative pose from the matches alone; the translation has length 1."""
+    rays_i: Floats  # (K, 3) unit rays in the frame of camera i
+    rays_j: Floats  # (K, 3) unit rays in the frame of camera j
+    j_from_i: Floats  # (4, 4) relative pose from the matches alone; the translation has length 1
 
 
 class PoseNoise(NamedTuple):
     """Standard deviations of the noise of a map's poses, per axis."""
 
     rotation_deg: float = 0.0
-    position: float = 0.0
-    """In map lengths, see `Survey.length`."""
+    position: float = 0.0  # in map lengths, see `Survey.length`
 
     def direction_deg(self, depth: float) -> float:
         """Return the standard deviation of the direction to a point at a depth, map lengths; NaN: far away."""
@@ -230,12 +226,9 @@ class SurveyedPairs:
 class _Fit(NamedTuple):
     """A change of intrinsics that minimizes the angles of all pairs."""
 
-    change: Floats
-    """(4,), see `_changed`."""
-    by_chance: float
-    """Probability that noise alone asks for such a change."""
-    errors: float
-    """Mean over the pairs of their median angle, radians."""
+    change: Floats  # (4,), see `_changed`
+    by_chance: float  # probability that noise alone asks for such a change
+    errors: float  # mean over the pairs of their median angle, radians
 
 
 def _changed(rays: Floats, change: Floats | None) -> Floats:

@@ -14,9 +14,8 @@ from toolkit.mapping.pose_noise import PoseNoise
 
 MIN_OBSERVATIONS = 12  # of an image; with fewer, its pose stays as it is
 MAX_ITERATIONS = 50
-PRIOR_NOISE = 3.0
-"""Standard deviation of a given position, in multiples of the measured noise, which misses slow drift."""
-LEAST_NOISE = PoseNoise(0.02, 0.001)  # one of the two may be zero
+PRIOR_NOISE = 3.0  # standard deviation of a given position, in multiples of the measured noise, which misses slow drift
+MIN_NOISE = PoseNoise(0.02, 0.001)  # one of the two may be zero
 MAX_ALIGNED = 50  # images by which the refined map is put where the given one was
 
 
@@ -35,7 +34,7 @@ def refined_poses(
     """
     origin = geometry.local_origin(local_map.world_from_cams[:, :3, 3])
     given = geometry.shifted(local_map.world_from_cams, -origin)
-    position_std = PRIOR_NOISE * max(noise.position, LEAST_NOISE.position) * local_map.length
+    position_std = PRIOR_NOISE * max(noise.position, MIN_NOISE.position) * local_map.length
     model = pycolmap.Reconstruction()
     seen = np.bincount(local_map.obs_image, minlength=len(given)) >= MIN_OBSERVATIONS
     config, priors = pycolmap.BundleAdjustmentConfig(), []
@@ -86,8 +85,8 @@ def refined_poses(
         alignment = align_to_map(
             refined[some],
             given[adjusted[some]],
-            center_noise_m=np.sqrt(3) * max(noise.position, LEAST_NOISE.position) * local_map.length,
-            rotation_noise_deg=np.sqrt(3) * max(noise.rotation_deg, LEAST_NOISE.rotation_deg),
+            center_noise_m=np.sqrt(3) * max(noise.position, MIN_NOISE.position) * local_map.length,
+            rotation_noise_deg=np.sqrt(3) * max(noise.rotation_deg, MIN_NOISE.rotation_deg),
         )
         poses[adjusted] = geometry.shifted(alignment.world_from_model.apply_to_pose(refined), origin)
     return poses

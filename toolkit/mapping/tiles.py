@@ -18,17 +18,14 @@ from toolkit.geometry import Floats, Ints
 from toolkit.mapping.local_map import LocalMap
 from toolkit.mapping.triangulation import refine_points
 
-OPEN_TILES = 16
-"""Number of tiles whose files are open at once during joining."""
+OPEN_TILES = 16  # number of tiles whose files are open at once during joining
 
 
 class Tile(NamedTuple):
     """Images that are triangulated together."""
 
-    core: Ints
-    """(n,) core images, ascending; each image of the map is in the core of one tile."""
-    images: Ints
-    """(m,) core images and the images matched with them, ascending."""
+    core: Ints  # (n,) core images, ascending; each image of the map is in the core of one tile
+    images: Ints  # (m,) core images and the images matched with them, ascending
 
 
 def plan_tiles(positions: Floats, pairs: Ints, max_core: int) -> list[Tile]:
@@ -75,12 +72,9 @@ class JoinedImages(NamedTuple):
 
     names: list[str]
     cameras: list[pycolmap.Camera]
-    world_from_cams: Floats
-    """(N, 4, 4)"""
-    keypoints: Callable[[int], NDArray[np.float32]]
-    """Returns the keypoints (n, 2) of an image, pixels."""
-    colors: Callable[[Ints, Ints], NDArray[np.uint8]]
-    """Returns the colors (n, 3) at n keypoints, given their image indices and keypoint indices."""
+    world_from_cams: Floats  # (N, 4, 4)
+    keypoints: Callable[[int], NDArray[np.float32]]  # returns the keypoints (n, 2) of an image, pixels
+    colors: Callable[[Ints, Ints], NDArray[np.uint8]]  # returns the colors (n, 3) at n keypoints of n images
 
 
 def join_tiles(
@@ -143,21 +137,17 @@ def _assign(
     last = np.zeros(count, np.int64)  # last tile of each image
     for number, tile in enumerate(tiles):
         last[tile.images] = number
-    # Keypoints, ascending, and their points, of images that later tiles have too.
-    assigned: dict[int, tuple[Ints, Ints]] = {}
+    # Observations in images that later tiles have too, as image << 32 | keypoint, ascending; and their points.
+    assigned = point_of = np.zeros(0, np.int64)
     first, sharing = [0], [list[int]() for _ in tiles]
     for number, tile in enumerate(tiles):
         part = load(number)
-        spans = [slice(*part.image_starts[index : index + 2]) for index in range(len(tile.images))]
-        earlier = np.full(len(part.obs_point), -1)  # point that an earlier tile assigned to each observation
-        for image, span in zip(tile.images.tolist(), spans, strict=True):
-            keypoints, points = assigned.get(image, (np.zeros(0, np.int64),) * 2)
-            if len(keypoints):
-                at = np.minimum(np.searchsorted(keypoints, part.obs_keypoint[span]), len(keypoints) - 1)
-                earlier[span] = np.where(keypoints[at] == part.obs_keypoint[span], points[at], -1)
-        shared = earlier >= 0
+        keys = tile.images[part.obs_image] << 32 | part.obs_keypoint
+        at = np.searchsorted(assigned, keys)
+        shared = np.append(assigned, -1)[at] == keys
+        earlier = point_of[at[shared]]
         same, counts = np.unique(
-            np.column_stack([part.obs_point[shared], earlier[shared]]), axis=0, return_counts=True
+            np.column_stack([part.obs_point[shared], earlier]), axis=0, return_counts=True
         )  # (point of this tile, earlier point)
         order = np.lexsort((same[:, 1], -counts, same[:, 0]))
         same = same[order][np.unique(same[order, 0], return_index=True)[1]]
@@ -166,16 +156,12 @@ def _assign(
         first.append(first[-1] + len(part.points))
         point = np.where(shared, -1, final[part.obs_point])
         np.save(folder / f"{number}.npy", point)
-        for owner in np.unique(np.searchsorted(first, point[point >= 0], "right") - 1).tolist():
+        for owner in np.unique(np.searchsorted(first, point[~shared], "right") - 1).tolist():
             sharing[owner].append(number)
-        for image, span in zip(tile.images.tolist(), spans, strict=True):
-            before = assigned.pop(image, (np.zeros(0, np.int64),) * 2)
-            if last[image] > number:
-                new = point[span] >= 0
-                keypoints = np.concatenate([before[0], part.obs_keypoint[span][new]])
-                points = np.concatenate([before[1], point[span][new]])
-                order = np.argsort(keypoints)
-                assigned[image] = keypoints[order], points[order]
+        assigned, point_of = np.concatenate([assigned, keys[~shared]]), np.concatenate([point_of, point[~shared]])
+        order = np.argsort(assigned)
+        order = order[last[assigned[order] >> 32] > number]
+        assigned, point_of = assigned[order], point_of[order]
     return np.array(first, np.int64), sharing
 
 

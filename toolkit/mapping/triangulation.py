@@ -14,25 +14,17 @@ from toolkit.geometry import Floats, Ints
 from toolkit.manifest import MapSettings
 from toolkit.mapping.local_map import LocalMap
 
-_CHUNK = 2048
-"""Number of points that are refined at once, so that their observations fit into the processor's cache."""
-_LEAST_DEPTH = 1e-3
-"""Smallest depth of a point in front of a camera, map lengths."""
+_CHUNK = 2048  # number of points that are refined at once, so that their observations fit into the processor's cache
+_MIN_DEPTH = 1e-3  # smallest depth of a point in front of a camera, map lengths
 MAX_REPROJECTION_ERROR_PX = 4.0
 """Observations with a larger reprojection error, in pixels, are removed from a point's track."""
 
 
 def triangulate(
-    names: Sequence[str],
-    cameras: Sequence[pycolmap.Camera],
-    world_from_cams: Floats,
-    keypoints: Sequence[NDArray[np.float32]],
-    pairs: Ints,
-    matches: Sequence[Ints],
-    settings: MapSettings | None = None,
-    seed: int = 0,
-    max_error_px: float = MAX_REPROJECTION_ERROR_PX,
-) -> LocalMap:
+    names: Sequence[str], cameras: Sequence[pycolmap.Camera], world_from_cams: Floats,
+    keypoints: Sequence[NDArray[np.float32]], pairs: Ints, matches: Sequence[Ints], settings: MapSettings | None = None,
+    seed: int = 0, max_error_px: float = MAX_REPROJECTION_ERROR_PX,
+) -> LocalMap:  # fmt: skip
     """Triangulate points from matches between images with known poses, which are kept fixed.
 
     COLMAP's triangulator builds the tracks. The points are then refined here, all at once: with fixed poses, each point
@@ -70,16 +62,10 @@ def triangulate(
 
 
 def _tracks(
-    names: Sequence[str],
-    cameras: Sequence[pycolmap.Camera],
-    world_from_cams: Floats,
-    keypoints: Sequence[NDArray[np.float32]],
-    pairs: Ints,
-    matches: Sequence[Ints],
-    settings: MapSettings,
-    seed: int,
+    names: Sequence[str], cameras: Sequence[pycolmap.Camera], world_from_cams: Floats,
+    keypoints: Sequence[NDArray[np.float32]], pairs: Ints, matches: Sequence[Ints], settings: MapSettings, seed: int,
     max_error_px: float,
-) -> tuple[Floats, Ints]:
+) -> tuple[Floats, Ints]:  # fmt: skip
     """Return points (P, 3) triangulated by COLMAP, and their observations (n, 3), sorted: image, keypoint, point."""
     graph = pycolmap.CorrespondenceGraph()
     reconstruction = pycolmap.Reconstruction()
@@ -124,14 +110,10 @@ def _tracks(
 class RefinedPoints(NamedTuple):
     """Points that minimize the reprojection errors of their observations."""
 
-    points: Floats
-    """(P, 3) in the world."""
-    observations: Ints
-    """(n, 3) image, keypoint and point."""
-    error2: float
-    """Sum of the squared reprojection errors of the observations, square pixels."""
-    freedom: int
-    """Degrees of freedom of `error2`."""
+    points: Floats  # (P, 3) in the world
+    observations: Ints  # (n, 3) image, keypoint and point
+    error2: float  # sum of the squared reprojection errors of the observations, square pixels
+    freedom: int  # degrees of freedom of `error2`
 
     @property
     def noise_px(self) -> float:
@@ -139,52 +121,46 @@ class RefinedPoints(NamedTuple):
         return float(np.sqrt(self.error2 / self.freedom)) if self.freedom else 1.0
 
 
-class _Projections(NamedTuple):
-    """n keypoints, to which points are to project."""
+def _gauss_newton(
+    points: Floats, point: Ints, rotation: Floats, translation: Floats, focal: Floats, plane: Floats, iterations: int
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Move points (P, 3) so that they project to n keypoints, each of the point with index `point` (n,).
 
-    rotation: Floats
-    """(n, 3, 3) from the world to the keypoint's camera."""
-    translation: Floats
-    """(n, 3)"""
-    focal: Floats
-    """(n,) pixels."""
-    plane: Floats
-    """(n, 2) the keypoints on the undistorted image plane at depth 1."""
+    Args:
+        rotation, translation: from the world to the keypoint's camera, (n, 3, 3) and (n, 3).
+        focal: focal lengths (n,), pixels.
+        plane: the keypoints (n, 2) on the undistorted image plane at depth 1.
 
-    def errors(self, points: Floats, point: Ints) -> tuple[Floats, Floats]:
-        """Return the errors (n, 2), pixels, of points (P, 3) of index `point` (n,), and the points in the cameras."""
-        in_cam = np.einsum("oij,oj->oi", self.rotation, points[point]) + self.translation
-        z = np.maximum(in_cam[:, 2], _LEAST_DEPTH)
-        return (in_cam[:, :2] / z[:, None] - self.plane) * self.focal[:, None], in_cam
+    Returns:
+        The points, the errors (n, 2) in pixels, and whether the points are in front of the cameras, (n,).
+    """
 
-    def refine(self, points: Floats, point: Ints, iterations: int) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        """Return the points after Gauss-Newton steps, their errors, and whether they are in front of the cameras."""
-        count = len(points)
-        for _ in range(iterations):
-            error, in_cam = self.errors(points, point)
-            jacobian = projection_jacobian(in_cam, self.focal) @ self.rotation
-            weight = 1.0 / (1.0 + (error**2).sum(1))
-            weighted = (weight[:, None, None] * jacobian).transpose(0, 2, 1)  # one einsum of all three is slower
-            hessian = (weighted @ jacobian).reshape(-1, 9)
-            gradient = (weighted @ error[:, :, None])[:, :, 0]
-            H = np.stack([np.bincount(point, h, count) for h in hessian.T], -1).reshape(-1, 3, 3)
-            g = np.stack([np.bincount(point, d, count) for d in gradient.T], -1)
-            # A little damping keeps points with an uncertain depth from jumping.
-            H += 1e-6 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
-            points = points - np.linalg.solve(H, g[..., None])[..., 0]
-        error, in_cam = self.errors(points, point)
-        return points, error, in_cam[:, 2] > _LEAST_DEPTH
+    def project() -> tuple[Floats, Floats]:
+        in_cam = np.einsum("oij,oj->oi", rotation, points[point]) + translation
+        z = np.maximum(in_cam[:, 2], _MIN_DEPTH)
+        return (in_cam[:, :2] / z[:, None] - plane) * focal[:, None], in_cam
+
+    for _ in range(iterations):
+        error, in_cam = project()
+        jacobian = projection_jacobian(in_cam, focal) @ rotation
+        weight = 1.0 / (1.0 + (error**2).sum(1))
+        weighted = (weight[:, None, None] * jacobian).transpose(0, 2, 1)  # one einsum of all three is slower
+        hessian = (weighted @ jacobian).reshape(-1, 9)
+        gradient = (weighted @ error[:, :, None])[:, :, 0]
+        # Without observations, bincount returns integers.
+        H = np.stack([np.bincount(point, h, len(points)) for h in hessian.T], -1, dtype=np.float64).reshape(-1, 3, 3)
+        g = np.stack([np.bincount(point, d, len(points)) for d in gradient.T], -1, dtype=np.float64)
+        # A little damping keeps points with an uncertain depth from jumping.
+        H += 1e-6 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
+        points = points - np.linalg.solve(H, g[..., None])[..., 0]
+    error, in_cam = project()
+    return points, error, in_cam[:, 2] > _MIN_DEPTH
 
 
 def refine_points(
-    points: Floats,
-    observations: Ints,
-    cameras: Sequence[pycolmap.Camera],
-    world_from_cams: Floats,
-    keypoints: Sequence[NDArray[np.float32]],
-    max_error_px: float = MAX_REPROJECTION_ERROR_PX,
-    iterations: int = 8,
-) -> RefinedPoints:
+    points: Floats, observations: Ints, cameras: Sequence[pycolmap.Camera], world_from_cams: Floats,
+    keypoints: Sequence[NDArray[np.float32]], max_error_px: float = MAX_REPROJECTION_ERROR_PX, iterations: int = 8,
+) -> RefinedPoints:  # fmt: skip
     """Minimize the reprojection errors of each point under a Cauchy loss of 1 px, by Gauss-Newton on all at once.
 
     Errors are measured on the undistorted image plane, times the focal length. Observations with a larger error than
@@ -216,8 +192,8 @@ def refine_points(
     def refine(number: int) -> tuple[Floats, Floats, NDArray[np.bool_]]:
         part = order[bounds[number] : bounds[number + 1]]
         chunk = points[firsts[number] : firsts[number] + _CHUNK]
-        projections = _Projections(rotation[part], translation[part], focal[part], plane[part])
-        return projections.refine(chunk, observations[part, 2] - firsts[number], iterations)
+        point = observations[part, 2] - firsts[number]
+        return _gauss_newton(chunk, point, rotation[part], translation[part], focal[part], plane[part], iterations)
 
     refined = list(prefetch(refine, range(len(firsts)), default_workers()))
     points = np.concatenate([chunk for chunk, _, _ in refined])

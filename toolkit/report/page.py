@@ -301,8 +301,8 @@ def _read_statuses(files: SceneFiles, messages: list[str]) -> pd.DataFrame:
     for path in pairs_of(files.poses_dir):
         try:
             results = PairResults.open(path)
-        except ArtifactError as error:
-            messages.append(str(error))
+        except ArtifactError:
+            messages.append(f"{path.name} cannot be read")
             continue
         devices = dict(zip(("map_device", "query_device"), results.devices, strict=True))
         tables.append(results.table.reindex(columns=STATUS_COLUMNS).assign(**devices))

@@ -18,7 +18,7 @@ import pandas as pd
 
 from toolkit.capture import Trajectory
 from toolkit.capture.tables import read_query_table
-from toolkit.errors import ArtifactError, DamagedError, first_line
+from toolkit.errors import ArtifactError, CaptureError, DamagedError, first_line
 from toolkit.files import (
     map_record_path,
     of_sequence,
@@ -66,7 +66,10 @@ class PairResults:
         require_whole(csv, of=poses)
         if csv.is_file() or not poses.is_file():
             return cls(poses, read_query_table(csv, ["status"]))
-        read = Trajectory.read(poses)
+        try:
+            read = Trajectory.read(poses)
+        except CaptureError as error:
+            raise ArtifactError(str(error)) from None
         keys = {"timestamp": read.timestamps, "device_id": np.asarray(read.device_ids, object)}
         return cls(poses, pd.DataFrame({**keys, "status": str(Status.OK)}))
 

@@ -33,10 +33,7 @@ log = logging.getLogger(__name__)
 
 ADDRESS = "TOOLKIT_CLUSTER"
 """Environment variable with the address of the scheduler whose workers the stages use."""
-MISSING = (
-    "--cluster needs Dask, which is not installed. To install it, run in the clone of the toolkit: "
-    "pip install -e '.[cluster]'"
-)
+MISSING = "--cluster needs Dask. To install it, run in the clone of the toolkit: pip install -e '.[cluster]'"
 SHARES_A_WORKER = 4
 """Shares per worker: small enough that all workers end at about the same time, and that a lost share costs little."""
 QUEUES = ("HTCondor", "LSF", "Moab", "OAR", "PBS", "SGE", "SLURM")
@@ -99,31 +96,22 @@ class Cluster:
                     try:
                         done, running = wait(running, timeout=_CHECK_S, return_when="FIRST_COMPLETED")
                     except TimeoutError:
-                        self._await_worker(label)
+                        self._client.wait_for_workers(1, timeout=_WAIT_S)
                         continue
                     for future in done:
                         future.result()
                         bar.update(futures[future])
         except KilledWorker as error:
-            raise ToolkitError(
-                f"{label}: several workers died of one share ({first_line(error)}). Most likely it needs more memory "
-                "than a worker has."
-            ) from None
+            text = f"{label}: several workers died of one share ({first_line(error)})."
+            raise ToolkitError(f"{text} Most likely it needs more memory than a worker has.") from None
         except CancelledError as error:  # the client cancels its shares when it loses the scheduler
-            raise ToolkitError(
-                f"{label}: the cluster's scheduler is gone ({first_line(error)}). Finished work is kept: the same "
-                "command continues from here, with or without a cluster."
-            ) from None
+            text = f"{label}: the cluster's scheduler is gone ({first_line(error)})."
+            raise ToolkitError(f"{text} Finished work is kept: the same command continues from here.") from None
+        except TimeoutError:
+            text = f"{label}: no worker is left, and none came for {_WAIT_S} s. What was done is kept."
+            raise ToolkitError(text) from None
         finally:
             self._client.cancel(list(futures))
-
-    def _await_worker(self, label: str) -> None:
-        try:
-            self._client.wait_for_workers(1, timeout=_WAIT_S)
-        except TimeoutError:
-            raise ToolkitError(
-                f"{label}: no worker is left, and none came for {_WAIT_S} s. What was done is kept."
-            ) from None
 
 
 def _run_share(here: str, environment: Mapping[str, str], pickled: bytes) -> None:
@@ -159,21 +147,15 @@ def _client(address: str) -> "Client":
         client = Client(address, set_as_default=False, timeout=_CONNECT_S)
         client.wait_for_workers(1, timeout=_WAIT_S)
     except (OSError, TimeoutError) as error:
-        raise ToolkitError(
-            f"The cluster at {address} has no worker that answers ({first_line(error)}). Is its scheduler running, "
-            "and does it have workers?"
-        ) from None
+        text = f"The cluster at {address} has no worker that answers ({first_line(error)})."
+        raise ToolkitError(f"{text} Is its scheduler running, and does it have workers?") from None
     try:
         versions = set(client.run(_version).values())
     except ImportError as error:
-        raise ToolkitError(
-            f"The workers at {address} cannot import the toolkit ({first_line(error)}). Install it where they run."
-        ) from None
+        versions = {f"none ({first_line(error)})"}
     if versions != {__version__}:
-        raise ToolkitError(
-            f"The workers at {address} have version {', '.join(sorted(versions))} of the toolkit, this machine has "
-            f"{__version__}. Install the same version on all machines."
-        )
+        found, do = f"version {', '.join(sorted(versions))} of the toolkit", "Install it on all machines."
+        raise ToolkitError.at(f"workers at {address}", found, __version__, do)
     return client
 
 
@@ -223,9 +205,8 @@ def _start(spec: str, stack: ExitStack) -> tuple[str, str]:
     kind, _, rest = spec.partition(":")
     if kind in ("tcp", "tls"):
         if not re.fullmatch(r"//(\[[\da-fA-F:.%]+\]|[^\[\]:/\s]+):\d{1,5}", rest):
-            raise ManifestError(
-                f"--cluster {spec}: expected {kind}://HOST:PORT; the default port of Dask's scheduler is 8786."
-            )
+            do = "The default port of Dask's scheduler is 8786."
+            raise ManifestError.at(f"--cluster {spec}", expected=f"{kind}://HOST:PORT", do=do)
         return spec, ""
     queue = next((name for name in QUEUES if name.lower() == kind), None)
     if kind == "local" and (not rest or (rest.isdecimal() and int(rest))):
@@ -234,7 +215,8 @@ def _start(spec: str, stack: ExitStack) -> tuple[str, str]:
         cluster = stack.enter_context(_queued_cluster(queue, Path(rest)))
     else:
         queues = ", ".join(f"{name.lower()}:FILE" for name in QUEUES)
-        raise ManifestError(f"--cluster {spec}: expected local, local:WORKERS, tcp://HOST:PORT, or one of {queues}.")
+        expected = f"local, local:WORKERS, tcp://HOST:PORT, or one of {queues}"
+        raise ManifestError.at(f"--cluster {spec}", expected=expected)
     return cluster.scheduler_address, cluster.dashboard_link
 
 
@@ -250,17 +232,10 @@ def _local_cluster(count: int) -> Any:
     count = count or len(gpus) or default_workers()
     # A worker runs one share at a time. The toolkit bounds its own memory, so Dask need not.
     options = {"nthreads": 1, "memory_limit": 0, "silence_logs": logging.ERROR}
-    workers = {
-        number: {
-            "cls": Nanny,
-            "options": options
-            | {
-                "env": dict.fromkeys((WORKERS, "OMP_NUM_THREADS"), str(max(1, default_workers() // count)))
-                | ({"CUDA_VISIBLE_DEVICES": gpus[number % len(gpus)]} if gpus else {})
-            },
-        }
-        for number in range(count)
-    }
+    threads = dict.fromkeys((WORKERS, "OMP_NUM_THREADS"), str(max(1, default_workers() // count)))
+    of_gpu = [{"CUDA_VISIBLE_DEVICES": gpu} for gpu in gpus] or [{}]
+    environments = [threads | of_gpu[number % len(of_gpu)] for number in range(count)]
+    workers = {number: {"cls": Nanny, "options": options | {"env": env}} for number, env in enumerate(environments)}
     scheduler = {"cls": Scheduler, "options": {"host": "127.0.0.1", "dashboard_address": ":0"}}
     return SpecCluster(workers=workers, scheduler=scheduler, silence_logs=logging.ERROR)
 
@@ -275,13 +250,11 @@ def _queued_cluster(queue: str, path: Path) -> Any:
         raise ManifestError(MISSING) from None
     try:
         options = yaml.safe_load(path.read_text(encoding="utf-8"))
-        jobs = options.pop("jobs")
-        if type(jobs) is not int or jobs < 1:
-            raise TypeError
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise ManifestError(f"--cluster: {path} cannot be read ({first_line(error)}).") from None
-    except (AttributeError, KeyError, TypeError):
-        raise ManifestError(f"--cluster: {path} has no `jobs: <number>`, the number of workers to start.") from None
+    jobs = options.pop("jobs", None) if isinstance(options, dict) else None
+    if type(jobs) is not int or jobs < 1:
+        raise ManifestError(f"--cluster: {path} has no `jobs: <number>`, the number of workers to start.")
     try:
         cluster = getattr(dask_jobqueue, f"{queue}Cluster")(**options)
     except (TypeError, ValueError) as error:

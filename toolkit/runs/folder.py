@@ -1,28 +1,38 @@
-"""The run folder: lock it against other runs, log to it, and clean up after killed runs."""
+"""The run folder: its lock, its log, its record `run.json`, and what killed runs left in it."""
 
+import importlib.metadata
 import json
 import logging
 import os
+import platform
 import re
 import shutil
 import socket
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from datetime import datetime
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 
-from toolkit.errors import ToolkitError
+from toolkit import __version__
+from toolkit.errors import ToolkitError, exit_code, sentence
 from toolkit.files import environment_variable, is_left_over, read_json, sweep_partials, write_text
-from toolkit.runs.record import RECORD
+from toolkit.manifest import STAGES, Manifest
 
 log = logging.getLogger(__name__)
 
-LOG = "run.log"
+LOG, RECORD = "run.log", "run.json"
 LOG_VARIABLE = "TOOLKIT_RUN_LOG"
 """Environment variable with the path of the log, for the kernels of a run."""
+OLDER = "older"
+"""Status of a stage that this run left out (`--only`), and whose results are older than what they were made from."""
+# Distributions whose versions may change results.
+_VERSIONS = ("numpy", "pycolmap", "faiss-cpu", "opencv-python-headless", "pandas", "pillow", "torch", "rerun-sdk")
 
 
 @contextmanager
@@ -41,10 +51,8 @@ def held(run_dir: Path) -> Iterator[None]:
     except Timeout:
         other = read_json(holder)
         who = f"process {other.get('pid', '?')} on {other.get('host', '?')}, since {other.get('since', '?')}"
-        raise ToolkitError(
-            f"{run_dir}: another run is using this folder: {who}. Wait until it ends, stop it, or write this run to "
-            "another folder (--set output_root=FOLDER)."
-        ) from None
+        do = "Wait until it ends, stop it, or write this run to another folder (--set output_root=FOLDER)."
+        raise ToolkitError(f"{run_dir}: another run is using this folder: {who}. {do}") from None
     try:
         me = {"pid": os.getpid(), "host": socket.gethostname()}
         with log_to(run_dir / LOG), environment_variable(LOG_VARIABLE, str((run_dir / LOG).absolute())):
@@ -106,12 +114,7 @@ def warnings_of_kernels(path: Path, start: int) -> list[str]:
 
     Warnings of this process are already on the terminal.
     """
-    try:
-        with path.open("rb") as file:
-            file.seek(start)
-            lines = file.read().decode("utf-8", errors="replace").splitlines()
-    except OSError:
-        return []
+    lines = path.read_bytes()[start:].decode("utf-8", errors="replace").splitlines()
     matches = (re.fullmatch(r"\S+ \S+ (\d+) WARNING toolkit\.\S+: (.+)", line) for line in lines)
     return list(dict.fromkeys(match[2] for match in matches if match and int(match[1]) != os.getpid()))
 
@@ -119,3 +122,122 @@ def warnings_of_kernels(path: Path, start: int) -> list[str]:
 def _close(file: logging.FileHandler) -> None:
     with suppress(OSError):  # a full disk: report the error that stopped the run, not this one
         file.close()
+
+
+@dataclass
+class RunLog:
+    """The content of `run.json`, rewritten after every stage.
+
+    A reused stage keeps the seconds and memory of the run that executed it. `total_seconds` and `work_seconds` count
+    only what this run executed, `peak_memory_mb` covers all stages.
+    """
+
+    run_dir: Path
+    manifest: Manifest
+    inputs: dict[str, str]
+    """Fingerprint of each scene's capture."""
+    code: str
+    """Fingerprint of the toolkit's code."""
+    earlier: Callable[[], list[dict[str, Any]]] = list
+    """Returns the rows of the stages that this run leaves out (`--only`)."""
+    status: str = "running"
+    """`running`, `done`, `incomplete` (more failed than the manifest tolerates), `failed`, or `interrupted`."""
+    error: str | None = None
+    exit_code: int | None = None
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    shown: set[str] = field(default_factory=set)
+    """Warnings that the terminal has already shown."""
+    started: float = field(default_factory=time.perf_counter)
+    created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Add the row of a stage that has ended, and write the record."""
+        self.rows.append(row)
+        self.write()
+
+    def end(self, error: BaseException | None = None, incomplete: str | None = None) -> None:
+        """Write how the run ended. If the disk is too full for that, remove the record rather than leave a wrong one.
+
+        Args:
+            error: the error that stopped the run.
+            incomplete: description of the failures, for a run that reached its end.
+        """
+        self.status, self.error, self.exit_code = ("incomplete", incomplete, 2) if incomplete else ("done", None, 0)
+        if error is not None:
+            self.status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+            self.error, self.exit_code = sentence(error), exit_code(error)
+        try:
+            self.write()
+        except OSError:
+            with suppress(OSError):
+                (self.run_dir / RECORD).unlink(missing_ok=True)  # frees space for the second try
+                self.write()
+            if error is None:
+                raise
+
+    def write(self) -> None:
+        """Write the current state to `run.json`."""
+        rows = self.all_rows()
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        work = sum(row.get("work_seconds", 0.0) for row in rows if row["status"] == "done")
+        content = {
+            "name": self.manifest.name,
+            "status": self.status,
+            "exit_code": self.exit_code,
+            "error": self.error,
+            "failed": failures(rows),
+            "created": self.created,
+            "pid": os.getpid(),
+            "manifest": self.manifest.model_dump(mode="json", exclude_none=True),
+            "versions": _versions(),
+            "machine": {"cores": cores, "python": platform.python_version(), "platform": platform.platform()},
+            "code": self.code,
+            "scenes": list(self.inputs),
+            "inputs": self.inputs,
+            "stages": rows,
+            "total_seconds": round(time.perf_counter() - self.started, 2),
+            "work_seconds": round(work, 2),
+            "peak_memory_mb": max((row.get("peak_memory_mb", 0) for row in rows), default=0),
+        }
+        write_text(self.run_dir / RECORD, json.dumps(content, indent=1) + "\n")
+
+    def all_rows(self) -> list[dict[str, Any]]:
+        """Return this run's rows and those of the stages that it left out."""
+        scenes = list(self.inputs)
+        rows = [*self.rows, *self.earlier()]
+        return sorted(rows, key=lambda row: (scenes.index(row["scene"]), STAGES.index(row["stage"])))
+
+
+def failures(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
+    """Return how many images, queries and pairs failed, `{kind: {"failed": n, "of": total}}`, from rows of stages."""
+    totals = {kind: {"failed": 0, "of": 0} for kind in ("images", "queries", "pairs")}
+    for row in rows:
+        counts = row.get("counts") or {}
+        for kind, stage, name in (("images", "embed", "unreadable"), ("queries", "localize", "failed")):
+            if row["stage"] == stage and {kind, name} <= counts.keys():
+                totals[kind]["failed"] += counts[name]
+                totals[kind]["of"] += counts[kind]
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        asked = [row for row in rows if row["scene"] == scene and "asked" in row]
+        # The rows of embed are recordings, not pairs. A failed pair fails in all later stages: count it once.
+        asked = [row for row in asked if row["stage"] != "embed"] or asked
+        totals["pairs"]["failed"] += len({one["what"] for row in asked for one in row.get("left_out", ())})
+        totals["pairs"]["of"] += max((row["asked"] for row in asked), default=0)
+    return totals
+
+
+def summary(run_dir: Path) -> dict[str, Any]:
+    """Return the output of `--json`: how the run ended, what failed, and the result of each stage."""
+    record = read_json(run_dir / RECORD)
+    kept = ("name", "status", "exit_code", "error", "failed", "created", "pid", "total_seconds")
+    of_stage = ("scene", "stage", "status", "reason", "seconds", "counts", "left_out", "error")
+    stages = [{key: row[key] for key in of_stage if key in row} for row in record.get("stages", ())]
+    return {key: record.get(key) for key in kept} | {"run": str(run_dir), "stages": stages}
+
+
+def _versions() -> dict[str, str]:
+    versions = {"toolkit": __version__, "python": platform.python_version()}
+    for name in _VERSIONS:
+        with suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
+    return versions

@@ -6,7 +6,7 @@ file, so that they do not use results which an earlier run made of the pair from
 
 import json
 import logging
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -102,20 +102,6 @@ def pair_text(row: Mapping[Any, Any]) -> str:
     if "map_device" not in row:
         return str(row.get("session", ""))
     return f"{row['query_device']} queries in the {row['map_device']} map"
-
-
-def way_out(pairs: Iterable[tuple[str, str]], devices: Sequence[str]) -> str:
-    """Return advice on how to exclude failing pairs in the manifest.
-
-    Args:
-        pairs: (map device, query device) of the pairs that were left out.
-        devices: all devices of the run.
-    """
-    pairs = list(pairs)
-    culprits = [device for device in devices if all(device in pair for pair in pairs)]
-    rest = [device for device in devices if device not in culprits]
-    keys = f"`devices: [{', '.join(rest)}]`" if len(culprits) == 1 and rest else "`devices:`"
-    return f"Repair the data, or exclude the pair with {keys} or `pairs:` in the manifest."
 
 
 def _note(folder: Path, name: str) -> Path:

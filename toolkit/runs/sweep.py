@@ -2,16 +2,16 @@
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import product
+from itertools import product, takewhile
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from toolkit.errors import ManifestError
-from toolkit.files import SceneFiles, fingerprint, link_folder
-from toolkit.manifest import STAGES, Manifest
+from toolkit.files import SceneFiles, fingerprint, link_folder, read_json
+from toolkit.manifest import Manifest
+from toolkit.runs.folder import RECORD
 
 MOST_RUNS = 100
 """Limit of runs in a sweep: more are most likely a mistake."""
@@ -19,16 +19,8 @@ _NO_RESULT = {"name", "output_root", "tolerate_failed", "description"}
 """Keys of a manifest that change no result."""
 _LONGEST = 100
 """Longest name of a run folder, letters; a longer one ends in a fingerprint."""
-
-
-@dataclass(frozen=True)
-class Shared:
-    """What a new run takes over from another one."""
-
-    run: str
-    """Name of the other run's folder."""
-    differing: list[str]
-    """Keys whose values differ; results that they change are not taken."""
+_TAKEN = ("embed", "retrieve", "rerank", "localize", "sequence")
+"""Stages whose results a run takes over, in order."""
 
 
 def changed_keys(plain: Manifest, changed: Manifest, overrides: Iterable[str]) -> dict[str, str]:
@@ -61,93 +53,83 @@ def variant_name(name: str, keys: Mapping[str, str]) -> str:
     """Return the name of a run that differs from the run `name` in these keys and values: `<name>-<key>-<value>`."""
     short = [key.rpartition(".")[2] for key in keys]
     labels = short if len(set(short)) == len(short) else list(keys)
-    parts = [f"{label}-{_plain(value)}" for label, value in zip(labels, keys.values(), strict=True)]
-    whole = "-".join([name, *parts])
+    values = (re.sub(r"[^\w.+-]+", "-", value).strip("-") or "none" for value in keys.values())
+    whole = "-".join([name, *(f"{label}-{value}" for label, value in zip(labels, values, strict=True))])
     return whole if len(whole) <= _LONGEST else f"{whole[: _LONGEST - 9]}-{fingerprint(whole)[:8]}"
 
 
-@dataclass(frozen=True)
-class SweptRun:
-    """One run of a sweep."""
-
-    name: str
-    """`<manifest>-<key>-<value>`, the name of the run folder."""
-    overrides: tuple[str, ...]
-    """`key=value` each, in the form of `--set`."""
-
-
-def swept_runs(name: str, sweeps: Sequence[str]) -> list[SweptRun]:
+def swept_runs(name: str, sweeps: Sequence[str]) -> dict[str, list[str]]:
     """Return the runs of a sweep: one per value or, for several keys, one per combination of values.
 
     Args:
         name: name of the manifest.
         sweeps: `key=a,b,c` each. Values are YAML: `embed.model=vlad,[megaloc, vlad]` has two values.
 
+    Returns:
+        The overrides of each run, `key=value` each as for `--set`, by its name, `<manifest>-<key>-<value>`.
+
     Raises:
         ManifestError: a sweep has another form, repeats a key, changes the captures, or has too many runs.
     """
-    keys, values = [], []
+    values: dict[str, list[str]] = {}
     for sweep in sweeps:
         key, equals, text = sweep.partition("=")
+        key = key.strip()
         try:
-            parsed = yaml.safe_load(f"[{text}]") if equals and key.strip() else None
+            parsed = yaml.safe_load(f"[{text}]") if equals and key else None
         except yaml.YAMLError:
             parsed = None
         if not parsed:
-            raise ManifestError(
-                f"--sweep {sweep}: expected key=value,value,..., for example localize.pnp.min_inliers=10,20,40."
-            )
+            example = "localize.pnp.min_inliers=10,20,40"
+            raise ManifestError.at(f"--sweep {sweep}", expected=f"key=value,value,..., for example {example}")
+        if key in values:
+            raise ManifestError.at(f"--sweep {key}", "it twice", "one list of values per key")
+        if key.partition(".")[0] in ("captures", "demo_data"):
+            do = f"The runs could not be compared: run the manifest once per value, --set {key}=... --set name=..."
+            raise ManifestError.at(f"--sweep {key}", expected="the same captures for all runs", do=do)
         texts = [yaml.safe_dump(value, default_flow_style=True, width=10**6).split("\n")[0] for value in parsed]
-        keys.append(key.strip())
-        values.append(list(dict.fromkeys(texts)))
-    if twice := [key for key in keys if keys.count(key) > 1]:
-        raise ManifestError(f"--sweep {twice[0]}: found it twice, expected one list of values per key.")
-    if other := [key for key in keys if key.partition(".")[0] in ("captures", "demo_data")]:
-        raise ManifestError(
-            f"--sweep {other[0]}: all runs of a sweep have the same captures, so that they can be compared. Run the "
-            f"manifest once per value instead: --set {other[0]}=... --set name=..."
-        )
-    combinations = list(product(*values))
+        values[key] = list(dict.fromkeys(texts))
+    combinations = [dict(zip(values, chosen, strict=True)) for chosen in product(*values.values())]
     if len(combinations) > MOST_RUNS:
-        raise ManifestError(f"--sweep: found {len(combinations)} runs, expected at most {MOST_RUNS}. Use fewer values.")
-    runs = []
-    for chosen in combinations:
-        values_of = dict(zip(keys, chosen, strict=True))
-        overrides = tuple(f"{key}={value}" for key, value in values_of.items())
-        runs.append(SweptRun(variant_name(name, values_of), overrides))
-    if len({run.name for run in runs}) < len(runs):
-        raise ManifestError(f"--sweep {' '.join(sweeps)}: two runs have the same folder name. Sweep one key at a time.")
+        raise ManifestError.at("--sweep", f"{len(combinations)} runs", f"at most {MOST_RUNS}", "Use fewer values.")
+    runs = {variant_name(name, keys): [f"{key}={value}" for key, value in keys.items()] for keys in combinations}
+    if len(runs) < len(combinations):
+        found = "two runs with the same folder name"
+        raise ManifestError.at(f"--sweep {' '.join(sweeps)}", found, do="Sweep one key at a time.")
     return runs
 
 
-def _plain(value: str) -> str:
-    """Return a value in a form that fits a folder's name."""
-    return re.sub(r"[^\w.+-]+", "-", value).strip("-") or "none"
+def take_over(donors: Sequence[Path], own: Manifest) -> None:
+    """Fill a new run folder with the results of another run that do not depend on the settings that differ.
 
-
-def take_over(donor: Path, run_dir: Path, scenes: Iterable[str], keys: Sequence[str]) -> None:
-    """Fill a new run folder with the results of another run that do not depend on the differing keys.
-
-    These are features, maps, and the results of all stages before the first stage with a differing key. Too much does
-    no harm: each stage reuses only what fits its settings. Files become hard links, since the toolkit never changes a
-    file but replaces it as a whole; or copies, if the disk does not support links.
+    These are features, maps, and the results of all stages before the first stage with other settings. Too much does no
+    harm: each stage reuses only what fits its settings. Files become hard links, since the toolkit never changes a file
+    but replaces it as a whole; or copies, if the disk does not support links.
 
     Args:
-        donor: run folder to take from.
-        run_dir: run folder to fill. Scenes that already have a folder there are skipped.
-        scenes: names of the captures.
-        keys: the differing keys, `stage.key`.
+        donors: run folders; the one that shares most results is taken.
+        own: manifest of the run. Scenes that already have a folder are skipped.
     """
-    stages = [key.partition(".")[0] for key in keys]
-    first = min((STAGES.index(stage) for stage in stages if stage in STAGES), default=0)
-    for scene in scenes:
-        theirs, mine = SceneFiles(donor, scene), SceneFiles(run_dir, scene)
-        if mine.root.exists():
+    shared = {donor: _shared_stages(donor, own) for donor in donors if donor.is_dir()}
+    donor = max(shared, key=lambda donor: shared[donor], default=None)
+    for scene in (Path(capture).name for capture in own.captures):
+        mine = SceneFiles(Path(own.output_root) / own.name, scene)
+        if donor is None or mine.root.exists():
             continue
-        of_stage = {"embed": "embeddings", "retrieve": "retrieval_dir", "rerank": "reranked_dir"}
-        of_stage |= {"localize": "poses_dir", "sequence": "poses_dir"}
-        earlier = {name for stage, name in of_stage.items() if STAGES.index(stage) < first}
-        for name in sorted({"features", "maps", "index"} | earlier):
-            source: Path = getattr(theirs, name)
-            if source.is_dir():
-                link_folder(source, getattr(mine, name))
+        theirs = SceneFiles(donor, scene)
+        made = {theirs.of_stage(stage) for stage in _TAKEN[: shared[donor]]}
+        for source in {theirs.features, theirs.maps, theirs.index} | made:
+            if source is not None and source.is_dir():
+                link_folder(source, mine.root / source.name)
+
+
+def _shared_stages(donor: Path, own: Manifest) -> int:
+    """Return how many stages of `_TAKEN`, from the first on, have the same settings in the record of a run."""
+    try:
+        theirs = Manifest.of(read_json(donor / RECORD).get("manifest"))
+    except ManifestError:  # without a record, or of an older version
+        return 0
+    if any(getattr(theirs, key) != getattr(own, key) for key in ("queries", "devices", "pairs", "extra_devices")):
+        return 0
+    before, after = ([one.stage(stage) if stage in one.stages else None for stage in _TAKEN] for one in (theirs, own))
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(before, after, strict=True)))

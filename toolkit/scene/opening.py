@@ -16,7 +16,7 @@ from toolkit.files import SceneFiles, file_fingerprint, fingerprint, pair_device
 from toolkit.manifest import LocalizeSettings, Settings, nearest
 from toolkit.mapping.local_map import map_path
 from toolkit.results.pair import MAPS
-from toolkit.runs.record import RECORD
+from toolkit.runs.folder import RECORD
 from toolkit.store.hdf5 import HDF5_ERRORS
 
 SETTINGS, SESSIONS_ROOT, RETRIEVAL = "settings", "sessions_root", "retrieval_dir"

@@ -10,7 +10,7 @@ import pandas as pd
 from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles, read_json
 from toolkit.results.pair import PairResults, pairs_of
-from toolkit.runs.record import RECORD
+from toolkit.runs.folder import RECORD
 from toolkit.scene.map import Map
 from toolkit.scene.opening import localized_scenes, no_such_run
 

@@ -5,7 +5,8 @@ not more than fit into it. A group that the toolkit wrote has a checksum, which 
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from toolkit.files import write_atomic
 
 HDF5_ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, OverflowError)
 """Errors of HDF5 and h5py for files that are torn, of another format, or with content that numpy does not support."""
-CHECKSUM = b"xxh3"
+CHECKSUM = "xxh3"
 """Attribute of a group: XXH3 of its name and arrays. Files of other tools lack it."""
 MOST_BYTES = 1 << 26
 """Memory limit for the arrays of a group, bytes; a larger file may fill as much memory as its own size."""
@@ -42,8 +43,7 @@ def write_groups(
             group = file.create_group(name)
             for key, array in arrays.items():
                 group[key] = array.astype(text) if array.dtype.kind == "O" else array
-            checksum = h5py.h5a.create(group.id, CHECKSUM, h5py.h5t.NATIVE_UINT64, h5py.h5s.create(h5py.h5s.SCALAR))
-            checksum.write(np.array(group_checksum(name, arrays), np.uint64))
+            group.attrs[CHECKSUM] = np.uint64(group_checksum(name, arrays))
 
 
 def read_group(file: h5py.File, name: str) -> dict[str, NDArray[Any]]:
@@ -55,102 +55,65 @@ def read_group(file: h5py.File, name: str) -> dict[str, NDArray[Any]]:
     Raises:
         DamagedError: the group is missing, or its content does not match its checksum.
     """
-    # h5py's low-level interface takes half the time, and there are as many groups as pairs of images.
     try:
-        group = _open_owned(file.id, name.encode())
-        if not isinstance(group, h5py.h5g.GroupID):
+        group = _open_owned(file, name)
+        if not isinstance(group, h5py.Group):
             raise ValueError("it is not a group")
         room, arrays = max(MOST_BYTES, file.id.get_filesize()), dict[str, NDArray[Any]]()
         for key in group:
             item = _open_owned(group, key)
-            if isinstance(item, h5py.h5d.DatasetID):
+            if isinstance(item, h5py.Dataset):
                 room -= _bytes_of(item)
                 if room < 0:
-                    raise ValueError(f"{key.decode()} of shape {item.shape} is larger than the file")
-                texts = item.dtype.kind == "O"
-                arrays[key.decode()] = np.asarray(h5py.Dataset(item)[()], object) if texts else _read(item)
-        if h5py.h5a.exists(group, CHECKSUM):
-            expected = np.zeros((), np.uint64)
-            h5py.h5a.open(group, CHECKSUM).read(expected)
-            if int(expected) != group_checksum(name, arrays):
-                raise ValueError("its content is not what was written")
+                    raise ValueError(f"{key} of shape {item.shape} is larger than the file")
+                arrays[key] = np.asarray(item[()])
+        expected = group.attrs.get(CHECKSUM)
+        if expected is not None and int(expected) != group_checksum(name, arrays):
+            raise ValueError("its content is not what was written")
     except HDF5_ERRORS as error:
-        raise DamagedError(
-            Path(file.filename),
-            f"{file.filename} is damaged at {name} ({first_line(error)}). If a run made it, run its stage again with "
-            "--force: each damaged group is made again.",
-        ) from None
+        text = f"{file.filename} is damaged at {name} ({first_line(error)}). If a run made it, run its stage again with"
+        raise DamagedError(Path(file.filename), f"{text} --force: each damaged group is made again.") from None
     return arrays
 
 
-def _open_owned(parent: Any, name: bytes) -> Any:
-    """Open an object in a file or a group; raise ValueError for links to other groups or files."""
-    for prefix in _prefixes(name):
-        if parent.links.get_info(prefix).type != h5py.h5l.TYPE_HARD:
-            raise ValueError(f"{prefix.decode()} is a link to elsewhere")
-    return h5py.h5o.open(parent, name)
+def _open_owned(parent: h5py.Group, name: str) -> Any:
+    """Open an object in a file or a group; raise KeyError if it is missing, ValueError for links to elsewhere."""
+    for end in [match.start() for match in re.finditer("/", name)] + [len(name)]:
+        if not parent.id.links.exists(name[:end].encode()):
+            raise KeyError(f"{name[:end]} is missing")
+        if parent.id.links.get_info(name[:end].encode()).type != h5py.h5l.TYPE_HARD:
+            raise ValueError(f"{name[:end]} is a link to elsewhere")
+    return parent[name]
 
 
-def _prefixes(name: bytes) -> Iterator[bytes]:
-    """Yield a/b/c as a, a/b, a/b/c."""
-    end = name.find(b"/")
-    while end >= 0:
-        yield name[:end]
-        end = name.find(b"/", end + 1)
-    yield name
-
-
-def _bytes_of(item: Any) -> int:
+def _bytes_of(item: h5py.Dataset) -> int:
     """Return the memory of an array, bytes; raise ValueError unless it has numbers or texts within the file itself."""
-    properties = item.get_create_plist()
-    if properties.get_layout() == h5py.h5d.VIRTUAL or properties.get_external_count():
+    if item.is_virtual or item.external:
         raise ValueError("its data are in another file")
-    dtype, shape = item.dtype, item.shape
-    count = math.prod(shape or ())
-    if h5py.check_string_dtype(dtype) is not None:
+    count = math.prod(item.shape or ())
+    if h5py.check_string_dtype(item.dtype) is not None:
         if count > MOST_TEXTS:
             raise ValueError(f"it has {count} texts in an array; expected at most {MOST_TEXTS}")
-    elif shape is None or dtype.kind not in "biuf":
-        raise ValueError(f"it has an array of the type {dtype}; expected numbers or texts")
-    return int(count * dtype.itemsize)
-
-
-def _read(item: Any) -> NDArray[Any]:
-    array = np.empty(item.shape, item.dtype)
-    item.read(h5py.h5s.ALL, h5py.h5s.ALL, array)
-    return array
+    elif item.shape is None or item.dtype.kind not in "biuf":
+        raise ValueError(f"it has an array of the type {item.dtype}; expected numbers or texts")
+    return int(count * item.dtype.itemsize)
 
 
 def group_names_of(file: h5py.File, array: str) -> list[str]:
     """Return the names of the groups with an array of this name, in alphabetical order. Links are not followed."""
-    names, seen, stack = list[str](), set[Any](), [b""]
-    while stack:
-        name = stack.pop()
-        group = h5py.h5o.open(file.id, name or b"/")
-        if name and array.encode() in group:
-            names.append(name.decode())
-        below = []
-        for key in group:
-            if group.links.get_info(key).type == h5py.h5l.TYPE_HARD:
-                item = h5py.h5o.get_info(group, key)
-                if item.type == h5py.h5o.TYPE_GROUP and item.addr not in seen:
-                    seen.add(item.addr)
-                    below.append(b"%b/%b" % (name, key) if name else key)
-        stack += reversed(below)
-    return names
+    names = list[str]()
+    file.visit(names.append)
+    return [name.removesuffix(f"/{array}") for name in names if name.endswith(f"/{array}")]
 
 
 def has_group(file: h5py.File, name: str) -> bool:
-    """Return whether a file has an object of this name. Links are not followed; a link counts as an object."""
-    links = file.id.links
+    """Tell whether a file has an object of this name. A link counts as an object; it is not followed."""
     try:
-        for prefix in _prefixes(name.encode()):
-            if not links.exists(prefix):
-                return False
-            if links.get_info(prefix).type != h5py.h5l.TYPE_HARD:
-                break
+        _open_owned(file, name)
+    except KeyError:
+        return False
     except HDF5_ERRORS:
-        return True  # `read_group` refuses it later, like a link
+        return True  # `read_group` refuses it later
     return True
 
 

@@ -23,10 +23,10 @@ import numpy as np
 from toolkit.errors import CaptureError
 from toolkit.files import read_json, write_folder
 from toolkit.geometry import Floats, invert, pose_from_qt
+from toolkit.manifest import DemoData
 from toolkit.synthetic.devices import DEVICES, Device, Sensor, walks
-from toolkit.synthetic.light import paint
 from toolkit.synthetic.recording import PICTURE_S, RADIOS, RATE_HZ, emitters_of, every_frame, scans, tracked
-from toolkit.synthetic.render import Rays, render
+from toolkit.synthetic.render import Rays, paint, render
 from toolkit.synthetic.scene import Quad, Scene, build_room, named_rng
 from toolkit.synthetic.textures import Image
 
@@ -36,20 +36,13 @@ if TYPE_CHECKING:
 FORMAT = 3  # increase it when the same settings produce other bytes
 
 
-@dataclass(frozen=True)
-class World:
+class World(DemoData):
     """Settings of the rendered world."""
 
-    rooms: int
-    frames: int  # map frames per room
-    queries: int  # query frames per room
-    seed: int
-    look_alikes: bool = False
-    alike: bool = False
-    seconds: int = 0  # length of a query recording; 0: as long as its images take
-    losses: int = 0  # tracking losses per query recording
-    gaps: int = 0  # gaps in the odometry of a query recording
-    radio: bool = False
+    @property
+    def queries(self) -> int:
+        """Query frames per room."""
+        return max(2, self.frames // 2)
 
     @property
     def hours(self) -> int:
@@ -68,7 +61,6 @@ class World:
     def build(self, index: int) -> Scene:
         """Return a room without textures."""
         return build_room(self.seed, index, self.look(index))
-
 
 
 @dataclass
@@ -274,17 +266,7 @@ def _write_session(path: Path, world: World, table: Tables, rooms: list[Scene]) 
 
 
 def render_capture(
-    out: str | Path,
-    rooms: int = 2,
-    frames: int = 12,
-    seed: int = 0,
-    progress: bool = True,
-    look_alikes: bool = False,
-    alike: bool = False,
-    seconds: int = 0,
-    losses: int = 0,
-    gaps: int = 0,
-    radio: bool = False,
+    out: str | Path, rooms: int = 2, frames: int = 12, seed: int = 0, progress: bool = True, **options: int
 ) -> Path:
     """Render a capture of `rooms` rooms by a phone, a headset and a robot; return its folder.
 
@@ -293,37 +275,23 @@ def render_capture(
 
     Args:
         out: the capture's folder; its name is the scene's name. `demo.json` in it records the settings.
-        rooms: number of rooms, at least 1.
-        frames: frames (rig poses) per room and map session, at least 2; query sessions have half as many.
-        seed: the same seed gives the same bytes.
-        look_alikes: doors, windows, shelves, cabinets and crates come in few models, shared by all rooms, so they are
-            easily confused.
-        alike: the last room looks exactly like the first.
-        seconds: length of a query recording, at least 20 per room. The recording then has odometry between its images
-            too, at 5 Hz. 0: the recording has one image per 1.4 s, and odometry at the images only.
-        losses: number of tracking losses per query recording; after each, odometry continues in another frame.
-            Needs `seconds`.
-        gaps: number of 4 s gaps in the odometry of a query recording. Needs `seconds`.
-        radio: add scans of Bluetooth and WiFi (the phone has no WiFi scans) from emitters in and around the rooms.
+        rooms, frames, seed, options: the settings `DemoData` of a manifest. The same seed gives the same bytes. A
+            query recording of given length (`seconds`, at least 20 per room) has odometry at 5 Hz. Without, it has one
+            image per 1.4 s, and odometry at the images only.
 
     Raises:
-        CaptureError: a setting is out of range, or `out` contains something other than a rendered capture.
+        ManifestError: an unknown or invalid setting.
+        CaptureError: settings that exclude each other, or `out` contains something other than a rendered capture.
     """
-    if rooms < 1 or frames < 2 or seed < 0:
-        raise CaptureError(f"Expected rooms >= 1, frames >= 2, seed >= 0; found {rooms=}, {frames=}, {seed=}.")
+    world = World.of({"rooms": rooms, "frames": frames, "seed": seed, **options})
+    seconds = world.seconds
     if seconds and (seconds < 20 * rooms or rooms * (frames // 4) < 2):
-        raise CaptureError(
-            f"Found {seconds=} for {rooms=} and {frames=}; expected seconds >= {20 * rooms}, 20 per room, and frames "
-            ">= 4, or 8 for a single room, so that a recording has two images or more."
-        )
-    if (losses or gaps) and not seconds:
-        raise CaptureError(f"Found {losses=}, {gaps=}: both concern the odometry between images, so set seconds too.")
-    settings = {"format": FORMAT, "rooms": rooms, "frames": frames, "seed": seed}
-    options = {"look_alikes": look_alikes, "alike": alike, "seconds": seconds, "losses": losses, "gaps": gaps}
-    settings |= {name: int(value) for name, value in {**options, "radio": radio}.items() if value}
-    queries = max(2, frames // 2)
-    world = World(rooms, frames, queries, seed, look_alikes, alike, seconds, losses, gaps, radio)
-    return _render(Path(out), world, settings, progress)
+        expected = f"seconds >= {20 * rooms}, 20 per room, and frames >= 4, or 8 for a single room"
+        raise CaptureError(f"Found {seconds=} for {rooms=} and {frames=}; expected {expected}.")
+    if (world.losses or world.gaps) and not seconds:
+        raise CaptureError("Losses and gaps concern the odometry between images, so set seconds too.")
+    given = {name: int(value) for name, value in world.model_dump().items() if value or name == "seed"}
+    return _render(Path(out), world, {"format": FORMAT} | given, progress)
 
 
 def _render(out: Path, world: World, settings: dict[str, int], progress: bool) -> Path:
@@ -331,10 +299,8 @@ def _render(out: Path, world: World, settings: dict[str, int], progress: bool) -
     if _is_complete(out, settings):
         return out
     if added := sorted(_files(out) - _rendered(out)[1]):
-        raise CaptureError(
-            f"{out} has to be rendered anew, which would delete {added[0]}: its demo.json does not list it. Move what "
-            "you have added, delete the folder, or choose another."
-        )
+        reason = f"which would delete {added[0]}: its demo.json does not list it"
+        raise CaptureError(f"{out} has to be rendered anew, {reason}. Move it, delete the folder, or choose another.")
     threads = cv2.getNumThreads()
     try:
         cv2.setNumThreads(1)  # the renderer's pool already has one thread per core
@@ -372,7 +338,7 @@ def _render_sessions(out: Path, world: World, progress: bool) -> None:
         try:
             for index in range(world.rooms):
                 scene = world.build(index)
-                paint_quad = partial(paint, scene, world.seed, world.look(index), look_alikes=world.look_alikes)
+                paint_quad = partial(paint, scene, world.seed, world.look(index))
                 for _ in pool.map(paint_quad, range(len(scene.quads))):
                     pass
                 tasks = []
@@ -394,15 +360,15 @@ def _render_sessions(out: Path, world: World, progress: bool) -> None:
 
 def _is_complete(out: Path, settings: dict[str, int]) -> bool:
     """Return whether `out` contains the complete capture with these settings, and perhaps more."""
-    (written, files, count), present = _rendered(out), _files(out)
-    return written == settings and files <= present and count in (None, len(present))
+    written, files = _rendered(out)
+    return written == settings and files <= _files(out)
 
 
-def _rendered(out: Path) -> tuple[dict[str, Any], set[str], int | None]:
-    """Return settings, files, and number of files of a rendered capture; earlier versions recorded only the number."""
+def _rendered(out: Path) -> tuple[dict[str, Any], set[str]]:
+    """Return settings and files of a rendered capture."""
     written = read_json(out / "demo.json")
     files = written.pop("files", None)
-    return (written, set(files), None) if isinstance(files, list) else (written, set(), files)
+    return written, set(files) if isinstance(files, list) else set()
 
 
 def _files(out: Path) -> set[str]:

@@ -1,6 +1,6 @@
 """The devices of the rendered capture, a phone, a headset and a robot: their cameras and trajectories."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -77,19 +77,6 @@ DEVICES = {
         (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), 1.5,
     ),
 }  # fmt: skip
-
-
-def scaled(device: Device, scale: float) -> Device:
-    """Return a device with pinhole cameras whose images have `scale` times the width and height."""
-    sensors = (
-        replace(
-            sensor,
-            size=(round(scale * sensor.size[0]), round(scale * sensor.size[1])),
-            params=tuple(scale * param for param in sensor.params),
-        )
-        for sensor in device.sensors
-    )
-    return replace(device, sensors=tuple(sensors))
 
 
 def looking(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Floats:

@@ -113,7 +113,7 @@ class Emitter:
 
 WIFI_S, BLUETOOTH_S = 4.0, 1.0  # between two scans
 SCAN_US = 600_000  # duration of a WiFi scan
-PATH_LOSS, WALL_DB, FADING_DB, FAINTEST_DBM = 2.5, 6.9, 3.0, -92.0
+PATH_LOSS, WALL_DB, FADING_DB, MIN_DBM = 2.5, 6.9, 3.0, -92.0
 """Path-loss exponent (log-distance model: T. S. Rappaport, Wireless Communications, 2002), loss per wall (COST 231
 multi-wall model), standard deviation of a reading, and the level below which nothing is received."""
 RADIOS = {"ios": ("bt",), "hl": ("wifi", "bt"), "spot": ("wifi", "bt")}  # iOS does not let an app scan WiFi
@@ -154,7 +154,7 @@ def received(rng: Rng, emitters: Sequence[Emitter], positions: Floats, rooms: Se
         for wall in (enter, leave):
             dbm -= WALL_DB * ((enter < leave) & (wall > 0) & (wall < 1))
     dbm = np.round(dbm + FADING_DB * rng.normal(size=dbm.shape))
-    return np.where(dbm > FAINTEST_DBM, dbm, np.nan)
+    return np.where(dbm > MIN_DBM, dbm, np.nan)
 
 
 def scans(

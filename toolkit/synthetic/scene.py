@@ -1,4 +1,4 @@
-"""The rooms of the rendered capture, built from textured rectangles. `light.paint` makes the textures.
+"""The rooms of the rendered capture, built from textured rectangles. `render.paint` makes the textures.
 
 Each random generator is seeded by the seed and the name of the thing it draws, not by the order of work.
 """
@@ -249,7 +249,7 @@ def _build_sky(scene: Scene) -> None:
 
 
 def build_room(seed: int, index: int, look: int | None = None) -> Scene:
-    """Return the geometry and materials of a room; `light.paint` makes its textures.
+    """Return the geometry and materials of a room; `render.paint` makes its textures.
 
     Args:
         index: number of the room, which determines its position.

@@ -9,8 +9,8 @@ from jupyter_server.services.contents.filemanager import FileContentsManager
 from traitlets.config import PyFileConfigLoader
 
 from toolkit.notebook import NOTEBOOKS
-from toolkit.runs.lab import WIDGET
 
+WIDGET = "application/vnd.jupyter.widget-view+json"
 ROOT = NOTEBOOKS.parent
 
 
