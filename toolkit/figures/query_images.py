@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
 
 from toolkit.capture.images import read_for_display
@@ -118,8 +119,6 @@ def draw_joined(axis: "Axes", query: QueryDetails, inches: float, by_kind: bool 
         inches: height in the figure.
         by_kind: see `draw_matches`; the query then also has the keypoints that the reference does not see.
     """
-    from matplotlib.collections import LineCollection
-
     image, height = query.cameras[0], query.cameras[0].camera.height
     end = draw_image(axis, image, inches)
     if by_kind:
@@ -155,8 +154,6 @@ def draw_localization(query: QueryDetails, title: str = "", unit: tuple[str, flo
         title: title of the figure; if the true pose is known, the errors are appended.
         unit: unit that lengths are shown in, see `metrics.length_unit`.
     """
-    from matplotlib.collections import LineCollection
-
     query = query.of_first_camera()
     shown, references = query.cameras[0], query.captioned_references()
     # The query is as high as two rows of references, to keep its points visible.

@@ -6,9 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import prefetch, read_for_display
@@ -18,9 +20,6 @@ from toolkit.geometry import Floats, local_origin, project, shifted
 from toolkit.results.images import REFERENCES, Localizations, QueryDetails, ShownImage, support_of
 from toolkit.results.metrics import is_posed
 from toolkit.viewer import blueprint as viewer
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 logger = logging.getLogger(__name__)
 
@@ -61,7 +60,6 @@ def record_localizations(
         tracks: positions (n, 3) of each piece of the query recordings: `odometry`, rigidly placed in the map, and
             `frames`, as estimated by the sequence stage.
     """
-
     started = time.perf_counter()
     poses = map_poses[is_posed(map_poses)]
     shift = -local_origin(poses[:, :3, 3])
@@ -89,8 +87,6 @@ def record_localizations(
 
 def _layout(name: str, poses: Floats, up: Floats) -> Any:
     """Return the viewer's layout: the scene, and beside it the chosen query, its references and a text page."""
-    import rerun.blueprint as rrb
-
     scene = viewer.scene_view(poses, up, name)
     cameras = {f"query, camera {k}": f"world/chosen/camera_{k}" for k in range(MAX_CAMERAS)}
     ranked = {f"reference {rank}": f"world/references/{rank}" for rank in range(1, REFERENCES + 1)}
@@ -110,20 +106,16 @@ def _layout(name: str, poses: Floats, up: Floats) -> Any:
     return rrb.Blueprint(rrb.Horizontal(scene, side, column_shares=[3, 2]), panel, collapse_panels=True)
 
 
-def _log_map_cameras(stream: "rr.RecordingStream", poses: Floats, size: float) -> None:
+def _log_map_cameras(stream: rr.RecordingStream, poses: Floats, size: float) -> None:
     """Log the map's cameras as small pyramids, all in one entity."""
-    import rerun as rr
-
     corners = size * np.array([[0, 0, 0], [-0.4, -0.3, 1], [0.4, -0.3, 1], [0.4, 0.3, 1], [-0.4, 0.3, 1.0]])
     outline = corners[[0, 1, 2, 0, 3, 4, 0, 1, 4, 3, 2]]
     lines = np.einsum("nij,kj->nki", poses[:, :3, :3], outline) + poses[:, None, :3, 3]
     stream.log("world/map_cameras", rr.LineStrips3D(lines.astype(np.float32), colors=viewer.rgb(MAP)), static=True)
 
 
-def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
+def _log_overview(stream: rr.RecordingStream, queries: Localizations) -> None:
     """Log all queries: estimates and error lines colored by error, true positions, failures at their references."""
-    import rerun as rr
-
     located, has_truth = is_posed(queries.estimated), is_posed(queries.true)
     colors = error_colors(queries.errors["translation_error_m"])
     labels = np.array([f"#{k} {describe(queries, k)}" for k in range(len(queries.names))], object)
@@ -147,7 +139,7 @@ def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
 class _ChosenWriter:
     """Logs one query at a time; each replaces the one before."""
 
-    def __init__(self, stream: "rr.RecordingStream", queries: Localizations, camera_depth_m: float) -> None:
+    def __init__(self, stream: rr.RecordingStream, queries: Localizations, camera_depth_m: float) -> None:
         self._stream, self._queries, self._depth_m = stream, queries, camera_depth_m
         self._sizes: dict[str, tuple[int, int]] = {}
         """Width and height of the images last logged, by entity."""

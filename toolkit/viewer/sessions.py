@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import pandas as pd
+import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import ArrayLike
 from tqdm.auto import tqdm
 
@@ -28,7 +30,6 @@ from toolkit.viewer import blueprint as viewer
 
 if TYPE_CHECKING:
     import pycolmap
-    import rerun as rr
 
 logger = logging.getLogger(__name__)
 
@@ -116,7 +117,6 @@ def record_session(
         CaptureError: unknown session, subsession or keyframe list.
         ArtifactError: `vis_retrieve_queries` without the h5 of `queries_pose`, or `queries_pose` of another session.
     """
-
     started = time.perf_counter()
     if every < 1:
         raise CaptureError(f"every={every}: expected 1 (every frame) or more.")
@@ -370,7 +370,7 @@ class _Reader:
 class _FrameWriter:
     """Logs frames in order; poses and intrinsics that have not changed are not logged again."""
 
-    def __init__(self, stream: "rr.RecordingStream", size: float, color: str) -> None:
+    def __init__(self, stream: rr.RecordingStream, size: float, color: str) -> None:
         self._stream, self._size, self._color = stream, size, color
         self._last: dict[tuple[str, str], list[float]] = {}
         """Values last logged, by entity and kind."""
@@ -452,8 +452,6 @@ class _FrameWriter:
 
 def _layout(session: Session, frames: list[_Frame], poses: Floats, up: Floats) -> Any:
     """Return the viewer's layout: the scene, and beside it a tab for each subsession with its cameras."""
-    import rerun.blueprint as rrb
-
     tabs: dict[str, dict[str, str]] = {}
     for frame in frames:
         for slot in frame.slots:
@@ -508,10 +506,8 @@ class _QueryPoses:
         return cls(poses, mapped, queried, h5, lines)
 
 
-def _log_queries(stream: "rr.RecordingStream", queries: _QueryPoses, session: Session, origin: Floats) -> None:
+def _log_queries(stream: rr.RecordingStream, queries: _QueryPoses, session: Session, origin: Floats) -> None:
     """Log the positions of queries (in a map session), and lines from queries to their references, from an origin."""
-    import rerun as rr
-
     poses = queries.poses
     if session.split == "map":
         labels = [f"{time} {device}" for time, device in zip(poses.timestamps, poses.device_ids, strict=True)]
