@@ -245,13 +245,7 @@ class WorstQueries:
         return pair.look(number)
 
 
-def inspect_query(
-    run: str | Path,
-    scene: str,
-    map: str,  # noqa: A002
-    query: str,
-    n: int | str = 0,
-) -> Inspection:
+def inspect_query(run: str | Path, scene: str, map: str, query: str, n: int | str = 0) -> Inspection:  # noqa: A002
     """Return one query of a finished run with the stored results of the localize stage.
 
     Args:

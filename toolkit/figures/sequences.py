@@ -59,26 +59,26 @@ class SequencePair:
         """The poses of the frames."""
         return self.stem.with_name(f"{self.stem.name}_sequence.txt")
 
-    def _path(self, end: str) -> Path:
+    def _whole(self, end: str) -> Path:
         """Return a file of the pair; raise ArtifactError if it is damaged."""
         path = self.stem.with_name(self.stem.name + end)
-        require_whole(path, of=None if end == ".txt" else self.stem.with_name(f"{self.stem.name}_sequence.txt"))
+        require_whole(path, of=None if end == ".txt" else self.path)
         return path
 
     @cached_property
     def frames(self) -> pd.DataFrame:
         """One row per frame, see `sequence.COLUMNS`."""
-        return read_query_table(self._path("_sequence.csv"), ["recording", "piece", "used"])
+        return read_query_table(self._whole("_sequence.csv"), ["recording", "piece", "used"])
 
     @cached_property
     def steps(self) -> dict[str, Trajectory]:
         """Query poses after each step: `single`, the steps that the stage wrote, and `sequence`."""
-        steps = {SINGLE: Trajectory.read(self._path(".txt"))}
-        if (path := self._path("_sequence_steps.csv")).is_file():
+        steps = {SINGLE: Trajectory.read(self._whole(".txt"))}
+        if (path := self._whole("_sequence_steps.csv")).is_file():
             for name, rows in read_query_table(path, ["step", *POSE_NAMES]).groupby("step", sort=False):
                 qt = rows[list(POSE_NAMES)].to_numpy(float)
                 steps[str(name)] = Trajectory(rows["timestamp"].to_numpy(np.int64), as_strings(rows["device_id"]), qt)
-        return {**steps, SEQUENCE: Trajectory.read(self._path("_sequence.txt"))}
+        return {**steps, SEQUENCE: Trajectory.read(self._whole("_sequence.txt"))}
 
     def odometry_tracks(self, session: Session) -> list[Floats]:
         """Return the positions (n, 3) of each piece of odometry, rigidly placed in the map by the step `voted`."""

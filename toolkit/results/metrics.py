@@ -1,6 +1,7 @@
 """Pose errors, recall, reasons of losses, the order of queries from worst to best, and overlap of images in view."""
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -182,22 +183,19 @@ def camera_messages(session: "Session", tables: Sequence[pd.DataFrame]) -> list[
         tables: `poses/<pair>.csv` of pairs with these queries: timestamp, device_id, status, focal_px and
             principal_point_px.
     """
-    posed: dict[str, int] = {}
+    posed, sensors, columns = Counter[str](), session.images["sensor_id"].to_numpy(), ("focal_px", "principal_point_px")
     fitted: dict[tuple[str, str], list[tuple[list[float], str]]] = {}
-    sensors = session.images["sensor_id"].to_numpy()
     for table in tables:
-        texts = {name: _texts(table, name) for name in ("focal_px", "principal_point_px")}
-        texts_of_status = table["status"].fillna(Status.FAILED)
-        for number, (images, text) in enumerate(zip(session.rows_of_keyframes(table), texts_of_status, strict=True)):
-            status, reason = Status.parse(text)
+        rows = table.reindex(columns=["status", *columns]).astype(object)
+        texts = rows.where(rows.notna(), "").astype(str).to_dict("records")
+        for images, row in zip(session.rows_of_keyframes(table), texts, strict=True):
+            status, reason = Status.parse(row["status"] or Status.FAILED)
             if status is Status.FAILED:
                 continue
             names = [re.sub(r"[_-]\d{6,}$", "", sensor_id) for sensor_id in sensors[images]]
-            for name in names:
-                posed[name] = posed.get(name, 0) + 1
-            for column, of_queries in texts.items() if status is Status.LOW_CONFIDENCE and reason else ():
-                values = of_queries[number].split(";")
-                for name, sensor_id, value in zip(names, sensors[images], values, strict=False):
+            posed.update(names)
+            for column in columns if status is Status.LOW_CONFIDENCE and reason else ():
+                for name, sensor_id, value in zip(names, sensors[images], row[column].split(";"), strict=False):
                     if value:
                         fitted.setdefault((name, column), []).append(([float(x) for x in value.split()], sensor_id))
     messages = []
@@ -219,12 +217,6 @@ def camera_messages(session: "Session", tables: Sequence[pd.DataFrame]) -> list[
             fits = f"the principal point that fits is {x:.0f}, {y:.0f} px {median_of}, {file} says {stated_xy}"
         messages.append(f"camera {name}: {fits}. Correct it and localize again.")
     return messages
-
-
-def _texts(table: pd.DataFrame, name: str) -> list[str]:
-    """Return a column as texts, empty where it is missing."""
-    values = (table[name] if name in table else pd.Series("", table.index)).astype(object)
-    return values.where(values.notna(), "").astype(str).tolist()
 
 
 def overlap_in_view(points: Floats, reference: Floats, world_from_cam: Floats, camera: "pycolmap.Camera") -> float:
