@@ -288,7 +288,8 @@ def _draw_further(figure: "SubFigure", details: QueryDetails) -> None:
     for panel in panels:
         panel.set_axis_off()
     for panel, (image, text, agrees) in zip(panels, images, strict=False):
-        draw_image(panel, image, 2.4, textwrap.fill(text, 30), "black" if agrees else ESTIMATED)
+        inches = 2.4 / max(1.0, image.ratio)
+        draw_image(panel, image, inches, textwrap.fill(text, 30), "black" if agrees else ESTIMATED)
         draw_matches(panel, image, 4, by_kind=True)
 
 
