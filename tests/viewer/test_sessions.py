@@ -1,6 +1,7 @@
 """Recordings read back: they hold the frames, poses and queries that the files say, and nothing else."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -350,10 +351,17 @@ def test_a_world_far_from_its_origin_is_shown_without_jitter(small_capture: Path
     queries = Localizations(["a", "b"], table, estimated, poses[:2], poses[:2, :3, 3])
     views = []
     for name, shift, capture in (("near", np.zeros(3), small_capture), ("far", offset, far)):
-        moved = [(0, QueryDetails([shown], [shown]).shifted(shift))]
+        at = {"world_from_cam": geometry.shifted(poses[1], shift), "points": shown.points + shift}
+        image = replace(shown, **at)
+        moved = replace(
+            queries,
+            estimated=geometry.shifted(estimated, shift),
+            true=geometry.shifted(poses[:2], shift),
+            nearest_reference=poses[:2, :3, 3] + shift,
+        )
         record_localizations(
             *(tmp_path / f"{name}.rrd", "view", geometry.shifted(poses, shift), poses[:, :3, 3] + shift, None),
-            *(queries.shifted(shift), moved),
+            *(moved, [(0, QueryDetails([image], [image]))]),
             up=[0, 0, 1],
             tracks={"frames": [poses[:, :3, 3] + shift]},
         )

@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from toolkit import geometry
 from toolkit.capture import Capture, Session
 from toolkit.geometry import Floats, Ints
 from toolkit.mapping.local_map import LocalMap
@@ -70,15 +69,6 @@ class ShownImage:
         """Width by height."""
         return float(self.camera.width / self.camera.height)
 
-    def shifted(self, offset: Floats) -> "ShownImage":
-        """Return the image in a world whose origin is shifted: `offset` (3,) is added to all positions."""
-        return replace(
-            self,
-            points=self.points + offset,
-            world_from_cam=geometry.shifted(self.world_from_cam, offset),
-            world_from_cam_true=geometry.shifted(self.world_from_cam_true, offset),
-        )
-
 
 _OF_A_MATCH = ("pixels", "points", "matches", "inlier", "found_by")
 
@@ -98,11 +88,6 @@ class QueryDetails:
     def has_matches(self) -> bool:
         """Whether the method matched keypoints, rather than used the poses of whole references."""
         return any(len(camera.matches) for camera in self.cameras)
-
-    def shifted(self, offset: Floats) -> "QueryDetails":
-        """Return the images in a world whose origin is shifted, see `ShownImage.shifted`."""
-        groups = (self.cameras, self.references, self.rejected)
-        return QueryDetails(*([image.shifted(offset) for image in images] for images in groups))
 
     def of_first_camera(self) -> "QueryDetails":
         """Return the first image alone, and references with only its correspondences."""
@@ -144,11 +129,6 @@ class Localizations:
     """World position (Q, 3) of the first reference of each query without a pose; else NaN."""
     unit: tuple[str, float] = ("m", 1.0)
     """Unit that lengths are shown in, see `metrics.length_unit`."""
-
-    def shifted(self, offset: Floats) -> "Localizations":
-        """Return the queries in a world whose origin is shifted, see `ShownImage.shifted`."""
-        estimated, true = (geometry.shifted(poses, offset) for poses in (self.estimated, self.true))
-        return replace(self, estimated=estimated, true=true, nearest_reference=self.nearest_reference + offset)
 
 
 @dataclass

@@ -63,20 +63,19 @@ def record_localizations(
     started = time.perf_counter()
     poses = map_poses[is_posed(map_poses)]
     shift = -local_origin(poses[:, :3, 3])
-    poses, points, localizations = shifted(poses, shift), np.asarray(points) + shift, localizations.shifted(shift)
-    details = ((number, query.shifted(shift)) for number, query in details)
+    poses = shifted(poses, shift)
     up = np.asarray(up_of_cameras(poses) if up is None else up, np.float64)
     size = viewer.camera_depth_m(poses[:, :3, 3])
     count = 0
     with viewer.open_recording(out, name, _layout(name, poses, up)) as stream:
         stream.log("world", viewer.world_axes(up), static=True)
-        viewer.log_points(stream, points, colors)
+        viewer.log_points(stream, np.asarray(points) + shift, colors)
         _log_map_cameras(stream, poses, size)
-        _log_overview(stream, localizations)
+        _log_overview(stream, localizations, shift)
         for kind, color in (("odometry", ORANGE), ("frames", SKY)):
             if tracks and tracks.get(kind):
                 viewer.log_lines(stream, f"world/recording/{kind}", [track + shift for track in tracks[kind]], color)
-        writer = _ChosenWriter(stream, localizations, 2 * size)
+        writer = _ChosenWriter(stream, localizations, 2 * size, shift)
         for number, chosen in prefetch(writer.read, details):
             writer.write(number, chosen)
             count += 1
@@ -114,7 +113,7 @@ def _log_map_cameras(stream: rr.RecordingStream, poses: Floats, size: float) -> 
     stream.log("world/map_cameras", rr.LineStrips3D(lines.astype(np.float32), colors=viewer.rgb(MAP)), static=True)
 
 
-def _log_overview(stream: rr.RecordingStream, queries: Localizations) -> None:
+def _log_overview(stream: rr.RecordingStream, queries: Localizations, shift: Floats) -> None:
     """Log all queries: estimates and error lines colored by error, true positions, failures at their references."""
     located, has_truth = is_posed(queries.estimated), is_posed(queries.true)
     colors = error_colors(queries.errors["translation_error_m"])
@@ -122,12 +121,12 @@ def _log_overview(stream: rr.RecordingStream, queries: Localizations) -> None:
 
     def dots(path: str, rows: NDArray[np.bool_], centers: Floats, color: Any, radius: float) -> None:
         style = {"colors": color, "radii": rr.Radius.ui_points(radius), "show_labels": False}
-        stream.log(path, rr.Points3D(centers[rows], labels=labels[rows].tolist(), **style), static=True)
+        stream.log(path, rr.Points3D(centers[rows] + shift, labels=labels[rows].tolist(), **style), static=True)
 
     dots("world/queries/true", has_truth, queries.true[:, :3, 3], viewer.rgb(TRUE), 3)
     dots("world/queries/estimated", located, queries.estimated[:, :3, 3], colors[located], 5)
     both = located & has_truth
-    lines = np.stack([queries.estimated[both, :3, 3], queries.true[both, :3, 3]], axis=1)
+    lines = np.stack([queries.estimated[both, :3, 3], queries.true[both, :3, 3]], axis=1) + shift
     stream.log("world/queries/error", rr.LineStrips3D(lines.astype(np.float32), colors=colors[both]), static=True)
     if len(queries.nearest_reference):
         lost = ~located & np.isfinite(queries.nearest_reference).all(1)
@@ -137,10 +136,12 @@ def _log_overview(stream: rr.RecordingStream, queries: Localizations) -> None:
 
 
 class _ChosenWriter:
-    """Logs one query at a time; each replaces the one before."""
+    """Logs one query at a time, each in place of the one before; `shift` (3,) is added to all positions."""
 
-    def __init__(self, stream: rr.RecordingStream, queries: Localizations, camera_depth_m: float) -> None:
-        self._stream, self._queries, self._depth_m = stream, queries, camera_depth_m
+    def __init__(
+        self, stream: rr.RecordingStream, queries: Localizations, camera_depth_m: float, shift: Floats
+    ) -> None:
+        self._stream, self._queries, self._depth_m, self._shift = stream, queries, camera_depth_m, shift
         self._sizes: dict[str, tuple[int, int]] = {}
         """Width and height of the images last logged, by entity."""
         self._jpeg_of = lru_cache(KEPT_JPEGS)(_jpeg_of)
@@ -167,15 +168,16 @@ class _ChosenWriter:
             camera, true = query.cameras[0].camera, query.cameras[0].world_from_cam_true
             has_truth = bool(is_posed(true))
             if has_truth:
-                stream.log("world/truth/camera_0", viewer.transform_of(true))
+                stream.log("world/truth/camera_0", viewer.transform_of(shifted(true, self._shift)))
             depth_m = self._depth_m if has_truth else viewer.HIDDEN_M
             pinhole = viewer.pinhole_of(camera, (camera.width, camera.height), depth_m, TRUE)
             stream.log("world/truth/camera_0", pinhole)
         points = np.concatenate([np.zeros((0, 3)), *(image.points[image.inlier] for image in query.cameras)])
-        dots = rr.Points3D(points, colors=viewer.rgb(GREEN), radii=rr.Radius.ui_points(3))
+        dots = rr.Points3D(points + self._shift, colors=viewer.rgb(GREEN), radii=rr.Radius.ui_points(3))
         stream.log("world/chosen_points", dots)
         located = bool(np.isfinite(center).all())
-        lines = [np.stack([center, image.world_from_cam[:3, 3]]) for image in query.references if located]
+        ends = [image.world_from_cam[:3, 3] for image in query.references if located]
+        lines = [np.stack([center, end]) + self._shift for end in ends]
         stream.log("world/lines", rr.LineStrips3D(lines, colors=viewer.rgb(ORANGE)))
         text = [f"**query {number}: {describe(self._queries, number)}**", ""]
         text += [f"- {image.name}" for image in query.cameras]
@@ -203,7 +205,7 @@ class _ChosenWriter:
             data, self._sizes[path] = self._jpeg_of(image.path)
             located = bool(is_posed(image.world_from_cam))
             if located:
-                stream.log(path, viewer.transform_of(image.world_from_cam))
+                stream.log(path, viewer.transform_of(shifted(image.world_from_cam, self._shift)))
             depth_m = self._depth_m if located else viewer.HIDDEN_M
             stream.log(path, viewer.pinhole_of(image.camera, self._sizes[path], depth_m, color))
             scale = np.array(self._sizes[path]) / [image.camera.width, image.camera.height]
