@@ -63,13 +63,14 @@ def write_rows(folder: Path, embeddings: Path | None, images: int, queries: int,
 
 def ask(folder: Path, images: int, factory: str, candidates: int) -> dict[str, float]:
     """Build an index and ask it; for `Flat` the exact search writes what the others are compared with."""
-    from toolkit.embedders import StoredVectors
+    from toolkit.embedders import StoredVectors, Vectors
     from toolkit.embedders.index import make_index
     from toolkit.embedders.search import search
     from toolkit.manifest import RetrieveSettings
 
     query = np.load(folder / "queries.npy")
-    vectors = StoredVectors((folder / "map.npy",), (0, images), query.shape[1], np.arange(images), normalize=True)
+    stored = StoredVectors((folder / "map.npy",), (0, images), query.shape[1], np.arange(images), normalize=True)
+    vectors = Vectors({"": stored})
     settings = RetrieveSettings(index=factory, index_candidates=candidates)
     started = time.perf_counter()
     index = make_index(folder / "embeddings", "map", vectors, settings, skip_existing=False)

@@ -40,11 +40,12 @@ def peak_mb() -> float:
 
 
 def search_disk(path: Path, images: int, queries: int, dim: int, topk: int, backend: str) -> list[float]:
-    from toolkit.embedders import StoredVectors
+    from toolkit.embedders import StoredVectors, Vectors
     from toolkit.embedders.search import search
 
     query = make_queries(queries, dim)
-    vectors = StoredVectors((path,), (0, images), dim, np.arange(images), normalize=True)
+    stored = StoredVectors((path,), (0, images), dim, np.arange(images), normalize=True)
+    vectors = Vectors({"": stored})
     search(query[:2], query[:64], 1, backend)  # libraries are loaded
     started, cpu = time.perf_counter(), time.process_time()
     scores, _ = search(query, vectors, topk, backend)

@@ -46,7 +46,7 @@ from toolkit.pose.base import Localizer, Prior, Query, QueryMatches, RoughPose, 
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer
 from toolkit.pose.result import QueryResult, Status
-from toolkit.prediction import registry as predictors
+from toolkit.prediction import network as predictors
 from toolkit.prediction.interface import Prediction
 from toolkit.prediction.simulated import SimulatedPredictor
 from toolkit.rerank import rerank_pairs
@@ -239,7 +239,7 @@ def test_nearest_is_the_pose_of_the_best_reference_and_labeled(small_capture: Pa
         ({"map_device": "drone"}, ToolkitError, r"drone.*ios, hl, spot"),
         ({"query_device": "drone"}, ToolkitError, r"drone.*ios, hl, spot"),
         ({"queries": "keyframes_best"}, CaptureError, "original"),
-        ({"map_device": "hl"}, ArtifactError, r"No references: .*SMALL_map_hl_query_ios\.jsonl is missing.*retrieve"),
+        ({"map_device": "hl"}, ArtifactError, r"SMALL_map_hl_query_ios\.jsonl: .*Run the retrieve stage first"),
     ],
 )
 def test_wrong_questions_are_refused(
@@ -531,7 +531,7 @@ def test_a_network_is_asked_once_about_a_query_that_escalates(
     add_other_kind(monkeypatch)
     predictor, asked = ByContent(Capture.open(small_capture), run.maps), list[int]()
 
-    def predict(groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]]) -> list[Prediction]:
+    def predict(groups: Sequence[Sequence[View]]) -> list[Prediction]:
         asked.append(len(groups))
         return ByContent.predict(predictor, groups)
 
@@ -995,7 +995,7 @@ class ByContent:
             for row in session.camera_rows.tolist()
         }
 
-    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
         def named(view: View) -> View:
             pixels = read_image(view.image) if isinstance(view.image, Path) else view.image
             return replace(view, name=self.names[pixels.tobytes()])
@@ -1261,7 +1261,7 @@ def test_what_a_network_has_matched_is_kept(small_capture: Path, run: SceneFiles
     ("options", "text"),
     [
         ({"features": ["surf"]}, "Unknown local features 'surf'"),
-        ({"features": []}, "features.kinds"),
+        ({"features": []}, "features: kinds is empty"),
         ({"matcher": "lightglue"}, "suits none of the features. Known for sift: mutual"),
     ],
 )

@@ -18,11 +18,11 @@ from tests.models.test_megaloc import tiny_megaloc
 from tests.models.test_vggt import tiny
 from tests.prediction.test_network_predictor import HIGHER, WIDE, Photographs, assert_same
 from tests.pretend import DEVICE, PretendTensor, pretending, resolved
+from toolkit.capture.masks import Masks
 from toolkit.embedders import megaloc, search
 from toolkit.features import lightglue, network
 from toolkit.features.lightglue import LightGlueMatcher
-from toolkit.features.network import NetworkExtractor
-from toolkit.features.superpoint import SuperPointExtractor
+from toolkit.features.network import NetworkExtractor, SuperPointExtractor
 from toolkit.manifest import AlikedSettings, SuperPointSettings
 from toolkit.models.vggt import VGGT
 from toolkit.prediction import network as predictors
@@ -130,9 +130,9 @@ def test_lightglue(device: None, state: dict[str, torch.Tensor]) -> None:
 def test_search(device: None) -> None:
     rng = np.random.default_rng(0)
     queries, rows = (rng.normal(size=(count, 16)).astype(np.float32) for count in (5, 40))
-    allowed = rng.random((5, 40)) < 0.5
-    found = search._torch_best(queries, rows, allowed, 3, "pretend", (16,))
-    expected = search._torch_best(queries, rows, allowed, 3, "cpu", (16,))
-    np.testing.assert_array_equal(found[1], expected[1])
-    best = search._torch_backend(queries, "pretend", (16,))(rows, 0, 3)
-    np.testing.assert_array_equal(best[1], search._torch_backend(queries, "cpu", (16,))(rows, 0, 3)[1])
+    masks = Masks(40, np.packbits(rng.random((5, 40)) < 0.5, axis=1, bitorder="little"), np.arange(5))
+    for limits in (masks, None):
+        found, expected = (
+            search._torch_backend(queries, limits, device, (16,))(rows, 0, 3) for device in ("pretend", "cpu")
+        )
+        np.testing.assert_array_equal(found[1], expected[1])

@@ -15,7 +15,7 @@ from toolkit import retrieve as retrieve_stage
 from toolkit.capture import Capture
 from toolkit.capture.masks import Masks, near
 from toolkit.embed import embed_sessions
-from toolkit.embedders import StoredVectors
+from toolkit.embedders import StoredVectors, Vectors
 from toolkit.embedders import search as search_module
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
 from toolkit.files import sidecar_path
@@ -76,7 +76,8 @@ def test_vectors_on_disk_are_searched_block_by_block(
     chosen = np.array([0, 2, 3, 4, 5, 12, 13, *range(15, 54)])
     stack = np.concatenate(parts).astype(np.float32)[chosen]
     starts = (0, *np.cumsum(sizes).tolist())
-    stored = StoredVectors(tuple(tmp_path / f"{n}.npy" for n in range(4)), starts, dim, chosen, normalize)
+    files = tuple(tmp_path / f"{n}.npy" for n in range(4))
+    stored = Vectors({"": StoredVectors(files, starts, dim, chosen, normalize)})
     np.testing.assert_array_equal(stored[:], unit(stack) if normalize else stack)
     np.testing.assert_array_equal(stored[np.array([1, 8, 40])], stored[:][[1, 8, 40]])
     np.testing.assert_array_equal(stored[np.array([40, 8, 1, 9, 8])], stored[:][[40, 8, 1, 9, 8]])
@@ -116,8 +117,8 @@ def test_several_sets_of_queries_on_disk_are_one(tmp_path: Path, monkeypatch: py
     for number, (size, chosen) in enumerate([(5, [0, 3]), (4, []), (9, [0, 1, 2, 7, 8])]):
         np.save(tmp_path / f"{number}.npy", rng.normal(size=(size, 8)))
         rows = np.array(chosen, np.int64)
-        parts.append(StoredVectors((tmp_path / f"{number}.npy",), (0, size), 8, rows, normalize=True))
-    stacked = StoredVectors.stack([*parts, parts[0]])
+        parts.append(Vectors({"": StoredVectors((tmp_path / f"{number}.npy",), (0, size), 8, rows, normalize=True)}))
+    stacked = Vectors.stack([*parts, parts[0]])
     query = np.concatenate([part[:] for part in (*parts, parts[0])])
     np.testing.assert_array_equal(stacked[:], query)
     expected = search(query, database, 4)
@@ -149,8 +150,7 @@ def test_a_masked_search_is_that_among_the_allowed_rows(
     masks = Masks(203, np.packbits(distinct, axis=1, bitorder="little"), which)
     allowed = np.where((which < 0)[:, None], True, distinct[which])
     expected = brute_force(query, database, 5, allowed)
-    for products, block, queries in ((1 << 23, 1 << 20, 1 << 20), (50, 4 * 8 * 21, 4 * 8 * 10)):
-        monkeypatch.setattr(search_module, "_PRODUCTS", products)
+    for block, queries in ((1 << 20, 1 << 20), (4 * 8 * 21, 4 * 8 * 10)):
         monkeypatch.setattr(search_module, "_BLOCK_BYTES", block)
         monkeypatch.setattr(search_module, "_QUERY_BYTES", queries)
         for found, wanted in zip(search(query, database, 5, backend, allowed=masks), expected, strict=True):

@@ -504,3 +504,10 @@ def test_a_notebook_looks_at_its_parameters_before_any_work(monkeypatch: pytest.
     monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
     with pytest.raises(ManifestError, match="topk"):
         notebook.start("retrieve", sessions_root="nowhere/sessions", out_jsonl="nowhere")
+
+
+def test_an_error_of_a_place_says_what_was_found_expected_and_is_to_do() -> None:
+    assert str(ManifestError.at("a.yaml: k", "3", "a text", "Quote it.")) == (
+        "a.yaml: k: found 3, expected a text. Quote it."
+    )
+    assert str(CaptureError.at("a.txt", expected="a line")) == "a.txt: expected a line."

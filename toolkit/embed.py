@@ -19,8 +19,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
 from toolkit.capture.images import default_workers, prefetch, read_image
-from toolkit.capture.turning import turn_image
-from toolkit.capture.upright import Turns, upright_turns
+from toolkit.capture.upright import Turns, turn_image, upright_turns
 from toolkit.embedders import WEIGHTS, Embedder, create_embedder, resolve_model, shows_upright
 from toolkit.errors import CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures

@@ -45,7 +45,7 @@ from toolkit.pose.intrinsics_check import MAX_SHARES, SIGNIFICANCE
 from toolkit.pose.pnp import PNP_FORMAT
 from toolkit.pose.result import QueryResult, status_counts
 from toolkit.prediction.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
-from toolkit.prediction.registry import open_predictor
+from toolkit.prediction.network import open_predictor
 from toolkit.results.metrics import camera_messages
 from toolkit.results.pair import query_group
 from toolkit.runs.pairs import PairRows

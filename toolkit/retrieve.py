@@ -227,7 +227,7 @@ def _search(
     Raises:
         ArtifactError: a value is not finite.
     """
-    stacked = type(database.vectors).stack([query.vectors for query in queries.values()])  # type: ignore[misc]
+    stacked = Vectors.stack([query.vectors for query in queries.values()])
     backend: Backend = "faiss" if settings.use_faiss else "torch"
     masks = [query.masks for query in queries.values() if query.masks is not None]
     try:
@@ -294,7 +294,7 @@ def _masks(
 ) -> tuple[Masks | None, dict[str, int]]:
     """Return the map images that each query image may find, None: all; and columns of the pair's row."""
     mask = settings.mask
-    images = database.session, database.rows, query.session, query.rows
+    images = (database.session, database.rows), (query.session, query.rows)
     priors = dict[str, Masks]()
     if poses is not None:
         priors["poses"] = pose_masks(poses, *images, mask.poses_distance_m, MAX_ANGLE_DEG)

@@ -150,7 +150,7 @@ def test_a_bad_depth_map_is_left_out_with_a_reason(
     with caplog.at_level(logging.WARNING):
         maps = DepthMaps(made.session)
         seen = maps.of(0)
-        maps._seen.cache_clear()
+        maps.of.cache_clear()
         maps.of(0)
     assert len(seen) == 0
     assert reason in seen.reason

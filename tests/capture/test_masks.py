@@ -67,7 +67,7 @@ def shown(masks: Masks) -> list[list[int]]:
 def radio(tmp_path: Path, of_map: str, of_query: str, least: int = 1) -> list[list[int]]:
     mapped = session_of(tmp_path / "ios_map", {"wifi.txt": of_map}, [(0, 0), (1, 0), (20, 0), (21, 0)])
     asked = session_of(tmp_path / "hl_query", {"wifi.txt": of_query})
-    return shown(radio_masks(mapped, np.arange(4), asked, np.arange(4), least, 2))
+    return shown(radio_masks((mapped, np.arange(4)), (asked, np.arange(4)), least, 2))
 
 
 def test_radio_finds_the_place_that_received_the_same(tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ def test_scans_count_for_their_recording_and_time_alone(tmp_path: Path) -> None:
     places = [(0.0, 0.0), (1.0, 0.0), (20.0, 0.0), (21.0, 0.0)]
     mapped = session_of(tmp_path / "ios_map", {"wifi.txt": of_map, "proc/subsessions.txt": "s\nt\n"}, places)
     asked = session_of(tmp_path / "hl_query", {"wifi.txt": wifi((0, a), (10, b)) + wifi((20, b), sensor="wifi")})
-    found = shown(radio_masks(mapped, np.arange(4), asked, np.arange(4), 1, 2))
+    found = shown(radio_masks((mapped, np.arange(4)), (asked, np.arange(4)), 1, 2))
     assert found == [[0, 1], [2, 3], [2, 3], [0, 1, 2, 3]]
 
 
@@ -113,7 +113,7 @@ def test_strengths_of_several_scans_and_of_bluetooth_are_joined(tmp_path: Path) 
     )
     places = [(0.0, 0.0), (1.0, 0.0), (20.0, 0.0), (21.0, 0.0)]
     mapped = session_of(tmp_path / "ios_map", {"wifi.txt": of_map, "bt.txt": beacon}, places)
-    assert shown(radio_masks(mapped, np.arange(4), asked, np.arange(1), 1, 2)) == [[1]]
+    assert shown(radio_masks((mapped, np.arange(4)), (asked, np.arange(1)), 1, 2)) == [[1]]
 
 
 def test_radio_of_one_side_limits_nothing(tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_radio_of_one_side_limits_nothing(tmp_path: Path) -> None:
     ):
         mapped = session_of(tmp_path / name / "ios_map", files[0], [(0, 0)])
         asked = session_of(tmp_path / name / "hl_query", files[1])
-        masks = radio_masks(mapped, np.arange(1), asked, np.arange(4), 1, 2)
+        masks = radio_masks((mapped, np.arange(1)), (asked, np.arange(4)), 1, 2)
         assert (masks.which == -1).all()
         assert shown(masks) == [[0]] * 4
 
@@ -137,12 +137,12 @@ def test_radio_in_blocks_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyP
     places = [tuple(place) for place in rng.uniform(0, 50, (20, 2))]
     mapped = session_of(tmp_path / "ios_map", {"wifi.txt": texts[0]}, places)
     asked = session_of(tmp_path / "hl_query", {"wifi.txt": texts[1]}, places)
-    whole = radio_masks(mapped, np.arange(20), asked, np.arange(20), 2, 2)
+    whole = radio_masks((mapped, np.arange(20)), (asked, np.arange(20)), 2, 2)
     assert set(whole.rows(0, 20).sum(axis=1)) == {2}
     monkeypatch.setattr(masks_module, "_BLOCK", 50)
-    assert shown(radio_masks(mapped, np.arange(20), asked, np.arange(20), 2, 2)) == shown(whole)
+    assert shown(radio_masks((mapped, np.arange(20)), (asked, np.arange(20)), 2, 2)) == shown(whole)
     some = np.array([3, 19, 4])
-    assert shown(radio_masks(mapped, np.arange(20), asked, some, 2, 2)) == shown(whole.choose(some))
+    assert shown(radio_masks((mapped, np.arange(20)), (asked, some), 2, 2)) == shown(whole.choose(some))
 
 
 # A degree of latitude near 47.4 is 111,177 m, one of longitude 75,457 m (WGS 84).
@@ -163,11 +163,11 @@ def test_fixes_are_compared_within_their_accuracies(tmp_path: Path) -> None:
         # The first has its fixes on both sides; one without an accuracy says nothing; the third is far from all.
         {"gps.txt": fixes((-1, -9, 0, 5), (1, 9, 0, 5), (10, 0, 100, -1), (20, 9000, 0, 5), (30, 0, 100, 5))},
     )
-    found = gps_masks(mapped, np.arange(4), asked, np.arange(4), margin_m=30, window_s=2)
+    found = gps_masks((mapped, np.arange(4)), (asked, np.arange(4)), margin_m=30, window_s=2)
     assert shown(found) == [[0, 1, 3], [0, 1, 2, 3], [0, 1, 2, 3], [2, 3]]
     assert found.which.tolist()[1:3] == [-1, -1]
     nothing = session_of(tmp_path / "spot_query", {"gps.txt": fixes((0, 0, 0, -1))})
-    assert (gps_masks(mapped, np.arange(4), nothing, np.arange(4), 30, 2).which == -1).all()
+    assert (gps_masks((mapped, np.arange(4)), (nothing, np.arange(4)), 30, 2).which == -1).all()
 
 
 def test_fixes_are_near_across_the_date_line(tmp_path: Path) -> None:
@@ -176,8 +176,8 @@ def test_fixes_are_near_across_the_date_line(tmp_path: Path) -> None:
         tmp_path / "hl_query", {"gps.txt": "0, s/gps, 0, -179.9999, 0, 1\n20000000, s/gps, 0, -179.9997, 0, 1\n"}
     )
     # They are 22.3 m and 44.5 m apart.
-    assert shown(gps_masks(mapped, np.arange(1), asked, np.arange(1), 20, 2)) == [[0]]
-    masks = gps_masks(mapped, np.arange(1), asked, np.arange(4), 20, 2)
+    assert shown(gps_masks((mapped, np.arange(1)), (asked, np.arange(1)), 20, 2)) == [[0]]
+    masks = gps_masks((mapped, np.arange(1)), (asked, np.arange(4)), 20, 2)
     assert (masks.which >= 0).tolist() == [True, False, False, False], "the third is too far"
 
 
@@ -196,9 +196,9 @@ def test_rough_poses_of_rigs_and_of_cameras(tmp_path: Path) -> None:
     assert asked.device_ids.tolist()[1] == "s/rig"
     rows = np.arange(4)
     everything = [0, 1, 2, 3]  # the third has no pose, the fourth is near nothing
-    assert shown(pose_masks(poses, mapped, rows, asked, rows, 2, 45)) == [[0, 1], [2, 3], everything, everything]
+    assert shown(pose_masks(poses, (mapped, rows), (asked, rows), 2, 45)) == [[0, 1], [2, 3], everything, everything]
     turned_away = Trajectory([0], ["s/cam"], [[0, 0, 1, 0, 0, 0, 0]])
-    assert pose_masks(turned_away, mapped, rows, asked, rows, 2, 45).which.tolist() == [-1] * 4
+    assert pose_masks(turned_away, (mapped, rows), (asked, rows), 2, 45).which.tolist() == [-1] * 4
 
 
 def test_priors_are_combined_and_one_that_contradicts_those_before_it_does_not_count() -> None:

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from toolkit.capture import Capture, Session, Trajectory, write_session
-from toolkit.capture.turning import turned_from_cam
-from toolkit.capture.upright import quarter_turns
+from toolkit.capture.upright import quarter_turns, turned_from_cam
 from toolkit.capture.world_up import estimate_world_up, up_of_cameras
 from toolkit.errors import CaptureError
 from toolkit.geometry import invert, make_pose

@@ -13,9 +13,9 @@ from toolkit.capture.masks import Masks
 from toolkit.embed import embed_sessions
 from toolkit.embedders import EMBEDDERS, load_embeddings, stored
 from toolkit.embedders import search as search_module
-from toolkit.embedders.index import JoinedIndex, VectorIndex
+from toolkit.embedders.index import VectorIndex
 from toolkit.embedders.search import fuse, search
-from toolkit.embedders.stored import JoinedVectors, open_descriptors
+from toolkit.embedders.stored import Vectors, open_descriptors
 from toolkit.errors import ArtifactError, ManifestError, WeightsError
 from toolkit.figures.explore import draw_similarity
 from toolkit.geometry import unit
@@ -122,11 +122,11 @@ def test_candidates_of_each_index_are_ranked_by_the_fused_similarity(masked: boo
     for part, of_query in zip(np.split(database, [6], axis=1), np.split(query, [6], axis=1), strict=True):
         index = faiss.IndexFlatIP(part.shape[1])
         index.add(np.ascontiguousarray(part))
-        parts.append(VectorIndex(index, 4))
+        parts.append(index)
         products = np.where(allowed, of_query @ part.T, -np.inf)
         candidates.append(np.argsort(-products, axis=1)[:, :4])
-    found = search(query, database, 5, index=JoinedIndex(tuple(parts), DIMS), allowed=allowed if masked else None,
-                   dims=DIMS)  # fmt: skip
+    index = VectorIndex(tuple(parts), 4)
+    found = search(query, database, 5, index=index, allowed=allowed if masked else None, dims=DIMS)
     for number, rows in enumerate(np.hstack(candidates)):
         rows = np.unique(rows)
         scores, order = brute(query[number : number + 1], database[rows], 5)
@@ -164,8 +164,7 @@ def test_descriptors_on_disk_are_those_of_images_that_have_all(tmp_path: Path) -
     one, two = (matrices[name].astype(np.float32) for name in held)
     expected = np.hstack([unit(one[[0, 1, 2, 4]]), unit(two[[4, 3, 2, 0]])])
     np.testing.assert_array_equal(vectors[:], expected)
-    assert isinstance(vectors, JoinedVectors)
-    twice = JoinedVectors.stack([vectors, vectors.choose(np.array([2, 0]))])
+    twice = Vectors.stack([vectors, vectors.choose(np.array([2, 0]))])
     np.testing.assert_array_equal(twice[np.array([5, 4, 1])], expected[[0, 2, 1]])
     (tmp_path / "two/ios_map/a/manifest.csv").write_text(
         (tmp_path / "two/ios_map/a/manifest.csv").read_text().replace("/a/", "/b/")

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from toolkit.capture.masks import Masks
-from toolkit.embedders import StoredVectors
+from toolkit.embedders import StoredVectors, Vectors
 from toolkit.embedders import index as index_module
 from toolkit.embedders.index import load_index, make_index
 from toolkit.embedders.search import search
@@ -36,9 +36,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def stored(place: Path, normalize: bool = True) -> StoredVectors:
+def stored(place: Path, normalize: bool = True) -> Vectors:
     rows = np.delete(np.arange(1600), [3, 800])
-    return StoredVectors((place / "0.npy", place / "1.npy"), (0, 700, 1600), DIM, rows, normalize)
+    return Vectors({"": StoredVectors((place / "0.npy", place / "1.npy"), (0, 700, 1600), DIM, rows, normalize)})
 
 
 def queries(place: Path) -> NDArray[np.float32]:
@@ -112,11 +112,11 @@ def test_an_index_is_kept_until_its_vectors_or_settings_change(place: Path, tmp_
     with pytest.raises(ArtifactError, match=r"ios_map\.faiss.*Retrieve again"):
         load_index(embeddings, "ios_map", vectors, settings)
 
-    def made(settings: RetrieveSettings = settings, vectors: StoredVectors = vectors) -> bool:
+    def made(settings: RetrieveSettings = settings, vectors: Vectors = vectors) -> bool:
         before = path.stat().st_ino if path.exists() else None
         index = make_index(embeddings, "ios_map", vectors, settings)
         assert index is not None
-        assert index.index.ntotal == len(vectors)
+        assert index.indexes[0].ntotal == len(vectors)
         return path.stat().st_ino != before
 
     assert [made(), made()] == [True, False]
@@ -145,8 +145,8 @@ def test_an_index_is_of_its_embeddings(place: Path, tmp_path: Path) -> None:
     vectors, settings = stored(tmp_path / "embeddings"), RetrieveSettings(index="RaBitQ", index_candidates=10)
     make_index(tmp_path / "embeddings", "ios_map", vectors, settings)
     assert load_index(tmp_path / "embeddings", "ios_map", vectors, settings) is not None
-    matrix = np.load(vectors.paths[1])
-    np.save(vectors.paths[1], matrix[::-1])
+    matrix = np.load(vectors.parts[""].paths[1])
+    np.save(vectors.parts[""].paths[1], matrix[::-1])
     with pytest.raises(ArtifactError, match="from other embeddings"):
         load_index(tmp_path / "embeddings", "ios_map", vectors, settings)
 
@@ -172,7 +172,7 @@ def test_a_vector_that_is_not_finite_is_told(place: Path, tmp_path: Path, factor
     vectors = np.load(place / "0.npy")
     vectors[5] = np.nan
     np.save(tmp_path / "0.npy", vectors)
-    broken = StoredVectors((tmp_path / "0.npy",), (0, 700), DIM, np.arange(700))
+    broken = Vectors({"": StoredVectors((tmp_path / "0.npy",), (0, 700), DIM, np.arange(700))})
     with pytest.raises(ValueError, match="database has 1 rows with NaN or infinite values, first row 5"):
         make_index(tmp_path / "embeddings", "ios_map", broken, RetrieveSettings(index=factory, index_candidates=10))
 

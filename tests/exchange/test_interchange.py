@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from toolkit.__main__ import app
 from toolkit.capture import Capture, Session
 from toolkit.capture.check import check_capture
-from toolkit.capture.exif import exif_camera, read_number
+from toolkit.capture.images import exif_camera, read_number
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.interchange import import_colmap, import_images
 from toolkit.geometry import invert, make_pose, pose_from_qt, qt_from_pose, quaternion_to_rotation

@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 
 from tests.models.test_aliked_network import photograph, random_state
 from toolkit.errors import ToolkitError, WeightsError
-from toolkit.features import aliked
-from toolkit.features.aliked import AlikedExtractor
 from toolkit.features.features import LocalFeatures, create_extractor
+from toolkit.features.network import AlikedExtractor
 from toolkit.manifest import AlikedSettings, FeaturesSettings
 
 SETTINGS = {"model": "aliked-t16", "max_keypoints": 60}
@@ -114,7 +113,7 @@ def test_tiny_photographs(extractor: AlikedExtractor, size: tuple[int, int]) -> 
 
 
 def test_nothing_to_find(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(aliked, "MIN_SCORE", 1.0)
+    monkeypatch.setattr(AlikedExtractor, "min_score", 1.0)
     (found,) = make().extract([photograph(64, 96)])
     assert found.keypoints.shape == (0, 2)
     assert found.descriptors.shape == (0, 64)

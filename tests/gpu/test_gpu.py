@@ -28,12 +28,10 @@ from toolkit import pipeline
 from toolkit.embedders.megaloc import MegaLocEmbedder
 from toolkit.errors import ToolkitError
 from toolkit.features.lightglue import LightGlueMatcher
-from toolkit.features.network import NetworkExtractor
-from toolkit.features.superpoint import SuperPointExtractor
+from toolkit.features.network import NetworkExtractor, SuperPointExtractor
 from toolkit.manifest import AlikedSettings
 from toolkit.models.compute import full_float32
-from toolkit.models.da3 import DepthAnything3
-from toolkit.models.da3.backbone import choose_reference
+from toolkit.models.da3 import DepthAnything3, choose_reference
 from toolkit.models.megaloc import MegaLoc
 from toolkit.models.omega import VGGTOmega
 from toolkit.models.vggt import VGGT

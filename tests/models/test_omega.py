@@ -21,8 +21,7 @@ from tests.models.test_vggt import (
 )
 from toolkit.errors import ImageError, WeightsError
 from toolkit.models.dpt import ResidualUnit
-from toolkit.models.omega import HEADS, VGGTOmega, cameras_from_pose_encoding, load_images
-from toolkit.models.omega.aggregator import SPECIAL, PlaceRope
+from toolkit.models.omega import HEADS, SPECIAL, PlaceRope, VGGTOmega, cameras_from_pose_encoding, load_images
 
 __all__ = ["golden"]  # a fixture
 

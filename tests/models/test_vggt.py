@@ -19,13 +19,13 @@ from toolkit.errors import ImageError, WeightsError
 from toolkit.models.dpt import add_position, dense_output
 from toolkit.models.vggt import (
     HEADS,
+    SPECIAL,
     VGGT,
     Views,
     cameras_from_pose_encoding,
     load_images,
     unproject_depth,
 )
-from toolkit.models.vggt.aggregator import SPECIAL
 from toolkit.models.vit import places_of_view, rope_of_places, rotate_
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -298,27 +298,6 @@ def test_other_wrong_input_is_refused(model: VGGT, images: torch.Tensor) -> None
 
 
 # Loading
-
-
-def test_keys_of_heads_that_are_not_held_are_passed_over() -> None:
-    whole = tiny().state_dict()
-    whole["track_head.tracker.anything"] = torch.zeros(3)
-    model = tiny(("depth",))
-    assert not any(key.startswith(("camera_head", "point_head")) for key in model.state_dict())
-    model.load_state_dict(whole, strict=True)
-    assert torch.equal(model.depth_head.norm.weight, whole["depth_head.norm.weight"])
-    tiny().load_state_dict(whole, strict=True)
-
-
-def test_strict_loading_refuses_the_rest() -> None:
-    model = tiny(("camera",))
-    state = tiny().state_dict()
-    with pytest.raises(RuntimeError, match=r"Missing key.*camera_head\.token_norm\.weight"):
-        model.load_state_dict({k: v for k, v in state.items() if k != "camera_head.token_norm.weight"})
-    with pytest.raises(RuntimeError, match=r"Unexpected key.*aggregator\.extra"):
-        model.load_state_dict({**state, "aggregator.extra": torch.zeros(1)})
-    with pytest.raises(RuntimeError, match=r"size mismatch for aggregator\.camera_token"):
-        model.load_state_dict({**state, "aggregator.camera_token": torch.zeros(1, 2, 1, 31)})
 
 
 def test_checkpoint_of_another_network_is_refused() -> None:

@@ -487,20 +487,20 @@ def test_no_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "says"),
+    ("content", "found"),
     [
-        ({**tensors(), "epoch": 3, "args": {}}, "expected only tensors by name; found also epoch, args"),
-        ({"epoch": 3}, "found a dict of epoch; expected a dict of tensors"),
-        ({}, "found a dict of nothing"),
-        ({"model": {"epoch": 3}}, "found a dict of model; expected"),
-        ([torch.ones(2)], "found a list; expected"),
-        (torch.ones(2), "found a Tensor; expected"),
-        ({3: torch.ones(2)}, "found also 3"),
+        ({**tensors(), "epoch": 3, "args": {}}, "epoch, args"),
+        ({"epoch": 3}, "epoch"),
+        ({}, "nothing"),
+        ({"model": {"epoch": 3}}, "model"),
+        ([torch.ones(2)], "list"),
+        (torch.ones(2), "Tensor"),
+        ({3: torch.ones(2)}, "3"),
     ],
 )
-def test_pickles_of_something_else(tmp_path: Path, content: Any, says: str) -> None:
+def test_pickles_of_something_else(tmp_path: Path, content: Any, found: str) -> None:
     torch.save(content, tmp_path / "model.pt")
-    with pytest.raises(WeightsError, match=says):
+    with pytest.raises(WeightsError, match=rf"model\.pt .*: found {found}; expected"):
         read_state_dict(tmp_path / "model.pt")
 
 
@@ -600,8 +600,7 @@ def test_wrong_keys_are_named(tmp_path: Path) -> None:
     assert message.startswith(f"{path}: these are not weights of TinyNet, which has 9 keys; found 8.")
     assert "\n  2 missing: backbone.0.bias, head.bias\n" in message
     assert "\n  1 unexpected: extra.weight\n" in message
-    assert "\n  1 mis-shaped: head.weight found (7, 4), expected (2, 4)\n" in message
-    assert "mis-typed" not in message
+    assert "\n  1 mis-shaped or mis-typed: head.weight found (7, 4) torch.float32, expected (2, 4) " in message
 
 
 def test_long_lists_are_cut() -> None:
@@ -620,9 +619,9 @@ def test_long_lists_are_cut() -> None:
     ],
 )
 def test_other_kinds_of_number_are_refused(key: str, dtype: torch.dtype) -> None:
-    expected = Tiny().state_dict()[key].dtype
     message = refusal({**state(), key: state()[key].to(dtype)})
-    assert f"1 mis-typed: {key} found {dtype}, expected {expected}" in message
+    assert f"1 mis-shaped or mis-typed: {key} found" in message
+    assert str(dtype) in message
 
 
 def test_a_refused_checkpoint_changes_nothing() -> None:

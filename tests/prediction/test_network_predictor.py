@@ -1,7 +1,6 @@
 """VGGT as a predictor: groups, batches, the cache, memory and bad images, with a small network of its kind."""
 
 import logging
-import threading
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -18,23 +17,21 @@ from tests.models.test_da3 import tiny as da3
 from tests.models.test_omega import tiny as omega
 from tests.models.test_vggt import tiny
 from toolkit.capture.images import read_image
-from toolkit.capture.turning import turn_image, turn_points, turned_from_cam
+from toolkit.capture.upright import turn_image, turn_points, turned_from_cam
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
 from toolkit.geometry import invert
 from toolkit.manifest import LocalizeSettings
 from toolkit.models.da3 import DepthAnything3
 from toolkit.models.da3 import cameras_from_pose_encoding as da3_cameras
 from toolkit.models.da3 import load_images as load_da3_images
+from toolkit.models.multiview import Views
 from toolkit.models.omega import VGGTOmega
 from toolkit.models.omega import load_images as load_omega_images
 from toolkit.models.vggt import VGGT, cameras_from_pose_encoding, load_images
-from toolkit.models.views import Views
 from toolkit.pose.base import View
-from toolkit.prediction.architectures import ARCHITECTURES
+from toolkit.prediction.architectures import ARCHITECTURES, PlacedView, shown_size
 from toolkit.prediction.interface import Prediction
-from toolkit.prediction.network import NetworkPredictor, TokenCache
-from toolkit.prediction.network_input import PlacedView, shown_size
-from toolkit.prediction.registry import open_predictor
+from toolkit.prediction.network import NetworkPredictor, TokenCache, open_predictor
 
 # In the network 518 x 112, 518 x 126 and 112 x 518 pixels.
 WIDE, HIGHER, PORTRAIT = (370, 80), (333, 81), (80, 370)
@@ -181,8 +178,8 @@ def create(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Create:
         monkeypatch.setattr(
             ROWS[name].network, "from_checkpoint", lambda _, heads, compute_dtype: small(heads, compute_dtype)
         )
-        if hasattr(ARCHITECTURES[name], "_channels"):
-            monkeypatch.setattr(ARCHITECTURES[name], "_channels", small().channels)
+        if ARCHITECTURES[name].channels:
+            monkeypatch.setattr(ARCHITECTURES[name], "channels", small().channels)
         checkpoint = tmp_path / "weights.pt"
         checkpoint.write_bytes(b"stands for weights")
         asked = {"name": name, "checkpoint": str(checkpoint), **options}
@@ -220,7 +217,7 @@ def test_other_rows(create: Create, photographs: Photographs, name: str, sizes: 
 
 def test_weights_of_the_other_size_are_refused(create: Create, photographs: Photographs) -> None:
     predictor = create("da3-base")
-    predictor._architecture._channels = 768  # type: ignore[attr-defined]
+    predictor._architecture.channels = 768
     with pytest.raises(WeightsError, match=r"weights\.pt: these are weights with 32 channels, not DA3-BASE.*768"):
         predictor.predict([photographs.group(WIDE, WIDE)])
 
@@ -327,53 +324,6 @@ def test_bfloat16_is_near_and_keeps_half_as_much(make: Make, photographs: Photog
     error = np.abs(found.model_from_cams - expected.model_from_cams).max()
     assert 1e-6 < error < 0.1
     assert_same(again, found)
-
-
-def test_the_next_call_is_decoded_while_the_network_runs(
-    make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The network waits here until all that the next call needs has been read; one map image is encoded already."""
-    shared = photographs.view()
-    first, second = ([photographs.view(in_map=False), photographs.view(), shared] for _ in range(2))
-    expected = make(cache_bytes=0).predict([first, second])
-    read, begun, done = NetworkPredictor._read, list[Path](), threading.Semaphore(0)
-
-    def reads(predictor: NetworkPredictor, placed: Any) -> Any:
-        if placed is not None:
-            begun.append(placed.view.image)
-        image = read(predictor, placed)
-        if placed is not None and placed.view in second[:2]:
-            done.release()
-        return image
-
-    monkeypatch.setattr(NetworkPredictor, "_read", reads)
-    predictor = make()
-    forward = predictor._model.forward
-
-    def waits(*arguments: Any) -> Any:
-        assert len(begun) > 5 or (done.acquire(timeout=20) and done.acquire(timeout=20))
-        return forward(*arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(predictor._model, "forward", waits)
-        [found] = predictor.predict([first], [second])
-    assert_same(found, expected[0])
-    for view in second[:2]:
-        view.image.unlink()
-    [found] = predictor.predict([second])
-    assert_same(found, expected[1])
-    assert sorted(begun) == sorted(view.image for view in [*first, *second[:2]]), "each once"
-    assert not predictor._begun
-
-
-def test_what_was_decoded_in_vain_is_forgotten(make: Make, photographs: Photographs) -> None:
-    one, other = photographs.group(WIDE, WIDE), photographs.group(WIDE, WIDE)
-    predictor = make()
-    expected = predictor.predict([one])
-    assert_same(predictor.predict([one], [other])[0], expected[0])
-    assert len(predictor._begun) == 2
-    assert_same(predictor.predict([one])[0], expected[0])
-    assert not predictor._begun
 
 
 # Memory

@@ -15,7 +15,7 @@ from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles
 from toolkit.manifest import LocalizeSettings
 from toolkit.pose.result import QueryResult
-from toolkit.prediction import registry as predictors
+from toolkit.prediction import network as predictors
 from toolkit.prediction.simulated import SimulatedPredictor
 from toolkit.scene import map as maps
 from toolkit.scene.map import WITHOUT_FEATURES, Map
@@ -55,9 +55,9 @@ def test_a_network_that_the_run_did_not_have_sees_the_query_as_upright_as_its_re
     predict, seen = SimulatedPredictor.predict, list[int]()
 
     class Seeing(SimulatedPredictor):
-        def predict(self, groups: Any, following: Any = ()) -> Any:
+        def predict(self, groups: Any) -> Any:
             seen.extend(view.turns for group in groups for view in group)
-            return predict(self, groups, following)
+            return predict(self, groups)
 
     monkeypatch.setattr(predictors, "SimulatedPredictor", Seeing)
     again = asking(small_capture, finished, settings=LocalizeSettings())

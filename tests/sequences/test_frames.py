@@ -209,7 +209,7 @@ def test_what_is_found_again_counts_for_later_frames(answering: Any) -> None:
         estimate = localizer.add(time, pose, picture, CAMERA)
     assert [image for image, near in asked if near is not None] == [1, 4, 6, 7, 10, 13, 16, 19]
     assert localizer._queries.frames.tolist() == [0, 2, 4, 6, 8]  # of the last 8 s
-    assert len(localizer._poses) == 10
+    assert len(localizer._motion) == 10
     assert geometry.pose_error(np.asarray(estimate.world_from_rig), way.world_from_rig[-1])[1] < 0.3
 
 

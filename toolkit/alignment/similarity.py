@@ -37,6 +37,10 @@ from toolkit.threads import fixed_sums
 OUTLIER_SHARE = 0.2  # expected share of wrong references
 WRONG_PLACE = 20.0  # least extent of the space of wrong centers, in multiples of the expected noise
 CENTER_NOISE_SHARE = 0.01  # noise over the typical distance of references: larger scenes are predicted less exactly
+MAX_POSITION_STD_M, MAX_ROTATION_STD_DEG = 0.2, 2.25  # of a pose that is `ok`: root of the trace of the covariance
+MIN_INLIERS = 2  # consistent references of a pose that is `ok`; nothing checks a single one
+MAX_RIVAL_SHARE = 0.5  # size of the largest other group of references that agree, over the number of inliers
+MAX_SCALE_STD = 0.2  # a scale with a larger relative standard deviation counts as unknown
 _STARTS = 6  # number of best hypotheses that are refined
 _ROUNDS = 10
 _LOG_PEAK = 1.5 * np.log(2 * np.pi)  # log normalization of a Gaussian in three coordinates
@@ -127,7 +131,6 @@ def align_to_map(
     *,
     center_noise_m: float = 0.02,
     rotation_noise_deg: float = 1.0,
-    max_scale_std: float = 0.2,
 ) -> Alignment:
     """Estimate the similarity from a predicted frame to the map, robustly.
 
@@ -148,7 +151,6 @@ def align_to_map(
         center_noise_m: expected noise of a predicted center, as a length. 1 % of the references' typical distance is
             added, in squares. Within a small factor of it, and of `rotation_noise_deg`, the data decide.
         rotation_noise_deg: expected noise of a predicted orientation, as an angle.
-        max_scale_std: a scale with a larger relative standard deviation counts as unknown.
 
     Returns:
         The alignment. Too few, coincident, collinear or contradicting references raise no error: unknown quantities get
@@ -199,7 +201,7 @@ def align_to_map(
         if ratios.grouped:
             depth = ratios.estimate(inliers)
     notes += ratios.notes
-    alignment = replace(problem.solve(best, depth, max_scale_std, notes), inliers=inliers, num_rivals=num_rivals)
+    alignment = replace(problem.solve(best, depth, notes), inliers=inliers, num_rivals=num_rivals)
     if undecided:
         alignment = replace(alignment, reason="; ".join([*notes, *undecided]), **_UNKNOWN)
     return alignment
@@ -243,37 +245,20 @@ def query_pose(alignment: Alignment, model_from_query: ArrayLike) -> tuple[Float
     return pose, covariance
 
 
-def is_trustworthy(
-    alignment: Alignment,
-    covariance: Floats,
-    *,
-    max_position_std_m: float = 0.2,
-    max_rotation_std_deg: float = 2.25,
-    min_inliers: int = 2,
-    max_rival_share: float = 0.5,
-) -> bool:
-    """Tell whether a pose from `query_pose` is `ok`.
+def is_trustworthy(alignment: Alignment, covariance: Floats) -> bool:
+    """Tell whether a pose from `query_pose`, with this covariance (6, 6), is `ok`.
 
-    The defaults require that errors of 5 deg and 0.5 m are more than 2.2 standard deviations away (2.5 for the
-    position, whose error may lie along one axis), that references confirm each other, and that no large group of
-    references agrees on another alignment.
-
-    Args:
-        alignment: the alignment that the pose comes from.
-        covariance: (6, 6) of the pose, from `query_pose`.
-        max_position_std_m: limit for the root of the trace of the position covariance.
-        max_rotation_std_deg: limit for the root of the trace of the rotation covariance.
-        min_inliers: least number of consistent references; a single one is not checked by anything.
-        max_rival_share: limit for the size of the largest group of 2 or more excluded references that agree on another
-            alignment, divided by the number of inliers.
+    Errors of 5 deg and 0.5 m must be more than 2.2 standard deviations away (2.5 for the position, whose error may lie
+    along one axis), references must confirm each other, and no large group of references may agree on another
+    alignment.
     """
     rivals = alignment.num_rivals if alignment.num_rivals > 1 else 0
     return bool(
         alignment.scale_known
-        and alignment.num_inliers >= min_inliers
-        and rivals <= max_rival_share * alignment.num_inliers
-        and np.sqrt(np.trace(covariance[3:, 3:])) <= max_position_std_m
-        and np.degrees(np.sqrt(np.trace(covariance[:3, :3]))) <= max_rotation_std_deg
+        and alignment.num_inliers >= MIN_INLIERS
+        and rivals <= MAX_RIVAL_SHARE * alignment.num_inliers
+        and np.sqrt(np.trace(covariance[3:, 3:])) <= MAX_POSITION_STD_M
+        and np.degrees(np.sqrt(np.trace(covariance[:3, :3]))) <= MAX_ROTATION_STD_DEG
     )
 
 
@@ -414,7 +399,7 @@ class _Problem:
             likelihood = likelihood - (np.log(noise / expected) / NOISE_FACTOR) ** 2 / 2
         return likelihood, np.exp(right - either)
 
-    def solve(self, best: _Candidate, depth: ScaleEstimate | None, max_scale_std: float, notes: list[str]) -> Alignment:
+    def solve(self, best: _Candidate, depth: ScaleEstimate | None, notes: list[str]) -> Alignment:
         """Return the weighted least squares alignment of a candidate's inliers, with its uncertainty."""
         state, share = best.state, best.members * self.weight
         rotation, scale = state.rotation[0], float(state.scale[0])
@@ -434,7 +419,7 @@ class _Problem:
             )[0]
             estimate = combined_scale(float(np.sum(rotation * cross)), square_c, center_noise / scale, depth)
             scale_std, conflict = (estimate.std, estimate.conflict) if estimate is not None else (np.inf, False)
-            if estimate is not None and scale_std <= max_scale_std:
+            if estimate is not None and scale_std <= MAX_SCALE_STD:
                 scale = estimate.value
             else:
                 scale = float(self.fit(best.members[None], fitted, depth).scale[0])
@@ -446,7 +431,7 @@ class _Problem:
             free = (3 * count - 3 * part, 3 * (count - 1) - 3 * (1 - part) - float(square_c > 0))
             rotation_noise = float(np.sqrt(noise_variance(angle, max(free[0], 0.0), self.rotation_prior)))
             center_noise = float(np.sqrt(noise_variance(distance, max(free[1], 0.0), self.center_prior)))
-        known = scale_std <= max_scale_std
+        known = scale_std <= MAX_SCALE_STD
         why = "baselines not above the noise of the centers, and no depth ratios"
         if depth is not None:
             why = "neither baselines nor depth ratios give it well enough"

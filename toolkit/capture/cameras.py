@@ -33,10 +33,8 @@ def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
     except ValueError as error:
         raise ValueError(f"found {params!r}, expected numbers after the model ({error}).") from None
     if len(numbers) != count + 2 or not np.all(np.isfinite(numbers)):
-        raise ValueError(
-            f"found {max(len(numbers) - 2, 0)} parameters for model {model} in {params!r}, "
-            f"expected width, height and {count} finite numbers."
-        )
+        found = f"found {max(len(numbers) - 2, 0)} parameters for model {model} in {params!r}"
+        raise ValueError(f"{found}, expected width, height and {count} finite numbers.")
     width, height = numbers[:2]
     if not all(1 <= size <= _LARGEST and size % 1 == 0 for size in (width, height)):
         raise ValueError(f"found image size {width:g} x {height:g}, expected whole numbers from 1 to {_LARGEST:,}.")
@@ -45,10 +43,8 @@ def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
         raise ValueError(f"found a focal length that is not positive in {params!r}, expected pixels.")
     for index, size in zip(camera.principal_point_idxs(), (width, height), strict=False):
         if not -size <= camera.params[index] <= 2 * size:
-            raise ValueError(
-                f"found a principal point at {camera.params[index]:g} in {params!r}, further outside the image than "
-                f"its size ({size:g}); expected pixels."
-            )
+            found = f"found a principal point at {camera.params[index]:g} in {params!r}"
+            raise ValueError(f"{found}, further outside the image than its size ({size:g}); expected pixels.")
     return camera
 
 

@@ -1,8 +1,10 @@
 """Find the inconsistencies of a capture and list each with file and line."""
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,37 +17,30 @@ from toolkit.capture.images import default_workers, prefetch, read_image, stored
 from toolkit.capture.names import HOW_TO_ALLOW, has_long_part
 from toolkit.capture.session import RAW_DATA, SUBSESSIONS, Session
 from toolkit.capture.tables import ALIGNED, COLUMNS, POSE_NAMES, SIGNALS, KeyIndex, key_of, read_table, times_of
-from toolkit.capture.trajectory import Trajectory
 from toolkit.capture.world_up import estimate_world_up, posed_photographs
 from toolkit.capture.writing import read_depth
 from toolkit.errors import CaptureError, ImageError
-from toolkit.geometry import Floats, unit
+from toolkit.geometry import unit
 
 ERROR, WARNING = "error", "warning"
-ASKED = "pruned_subsampled"
-"""Keyframe list that manifests localize by default."""
-SAME_PLACE_M = 1e-6
-"""Positions closer than this are the same, meters."""
-PLACE_SHARE = 0.005
-"""Positions closer than this share of the extent of all positions are one place, as of a tripod."""
-WALK = 10
-"""Smallest number of steps between camera positions from which the direction of motion is judged."""
-UNIT_TOLERANCE = 1e-3
-"""Largest deviation of a quaternion's length from 1; beyond, it is not a rotation or has lost digits."""
+ASKED = "pruned_subsampled"  # keyframe list that manifests localize by default
+SAME_PLACE_M = 1e-6  # positions closer than this are the same, meters
+PLACE_SHARE = 0.005  # positions closer than this share of the extent of all positions are one place, as of a tripod
+WALK = 10  # smallest number of steps between camera positions from which the direction of motion is judged
+UNIT_TOLERANCE = 1e-3  # largest deviation of a quaternion's length from 1; beyond, it has lost digits
+Rule = tuple[Any, str, str]
+"""Which rows break the rule, (N,) bool; the message, with `{column}` for a row's value; and the severity."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One inconsistency."""
+    """One inconsistency: `error`, data are missing or wrong, or `warning`, data may be wrong."""
 
     session: str
-    file: str
-    """Relative to the session's folder."""
-    line: int
-    """Line number from 1; 0 if the problem concerns the whole file."""
+    file: str  # relative to the session's folder
+    line: int  # line number from 1; 0 if the problem concerns the whole file
     message: str
     severity: str
-    """`error`: data are missing or wrong; `warning`: data may be wrong."""
 
     def __str__(self) -> str:
         where = f"{self.session}/{self.file}" + (f":{self.line}" if self.line else "")
@@ -114,32 +109,36 @@ class _SessionCheck:
     """Collects the problems of one session."""
 
     def __init__(self, path: Path, deep: bool) -> None:
-        self.session = Session(path, strict=False)
+        self.session = session = Session(path, strict=False)
         self.deep = deep
         self.problems: list[Problem] = []
         self.missing: dict[str, int] = {}
         self.sizes: dict[str, tuple[int, int]] = {}
         """Image width and height of each camera and depth sensor."""
-        self.sensors = self._rows("sensors.txt")
-        self.rig_ids = self.session.rigs["rig_id"] if self.session.rigs is not None else pd.Series([], dtype=object)
-        self.cameras = self.sensors[self.sensors["sensor_type"] == "camera"]["sensor_id"]
-
-    def _rows(self, file: str) -> pd.DataFrame:
-        """Return the well-formed rows of a file, indexed by line number."""
-        table = self.session.tables[file]
-        return table.frame(*table.columns).set_index(pd.Index(table.lines))
+        # Reading these adds their files to `session.tables`.
+        _ = session.subsessions, session.depths, [session.keyframes(name) for name in session.keyframe_files]
+        _ = session.wifi, session.bluetooth, session.gps
+        self.rows = {
+            file: table.frame(*table.columns).set_index(pd.Index(table.lines)) for file, table in session.tables.items()
+        }
+        """The well-formed rows of each file, indexed by line number."""
+        sensors = self.rows["sensors.txt"]
+        self.rig_ids = session.rigs["rig_id"] if session.rigs is not None else pd.Series([], dtype=object)
+        self.cameras = sensors[sensors["sensor_type"] == "camera"]["sensor_id"]
+        self.devices = pd.concat([self.rig_ids, sensors["sensor_id"]])
 
     def _add(self, file: str, line: int, message: str, severity: str = ERROR) -> None:
         self.problems.append(Problem(self.session.id, file, int(line), message, severity))
 
+    def _add_rows(self, file: str, mask: Any, message: str, severity: str = ERROR) -> None:
+        """Report the rows of a file where the mask holds; `{column}` in the message is replaced by the row's value."""
+        rows = self.rows[file][mask]
+        for line, row in zip(rows.index, rows.to_dict("records"), strict=True):
+            self._add(file, line, message.format(**row), severity)
+
     @property
     def _has_errors(self) -> bool:
         return any(problem.severity == ERROR for problem in self.problems)
-
-    def _add_rows(self, file: str, rows: pd.DataFrame, message: str, severity: str = ERROR) -> None:
-        """Report rows of a file; `{column}` in the message is replaced by the row's value."""
-        for line, row in zip(rows.index, rows.to_dict("records"), strict=True):
-            self._add(file, line, message.format(**row), severity)
 
     def run(self) -> None:
         session = self.session
@@ -152,67 +151,84 @@ class _SessionCheck:
             self._add("", 0, message, WARNING)
         if not len(session.images) and not session.tables["images.txt"].problems:
             self._add("images.txt", 0, "lists no image", WARNING)
-        # Reading these adds their files to `session.tables`.
-        _ = session.subsessions, session.depths, [session.keyframes(name) for name in session.keyframe_files]
-        _ = session.wifi, session.bluetooth, session.gps
-        for file in session.tables:
-            self._check_rows(file, self._rows(file))
-        self._check_cameras()
-        for file in ("images.txt", "depths.txt"):
-            if file in session.tables:
-                self._check_files(file, self._rows(file))
-        for file, trajectory in (("trajectories.txt", session.trajectory), (ALIGNED, session.ground_truth)):
-            if trajectory is not None and file in session.tables:
-                self._check_trajectory(file, trajectory)
-        if session.split == "map":
-            self._check_images_have_poses()
-        for file in session.keyframe_files.values():
-            self._check_keyframes(file, self._rows(file))
+        for file, table in session.tables.items():
+            for line, message in table.problems:
+                self._add(file, line, message)
+        if session.split == "map" and session.trajectory is None and len(session.images):
+            self._add("trajectories.txt", 0, "file not found: images of a map session need poses")
         if session.split == "query" and ASKED not in session.keyframe_files:
             lists = ", ".join(session.keyframe_files) or "none"
             message = f"no such list, the default for queries; found: {lists}. Set `queries` in the manifest, or add it"
             self._add(f"proc/keyframes_{ASKED}.txt", 0, message, WARNING)
-        if SUBSESSIONS in session.tables:
-            self._check_subsessions()
+        self._check_cameras()
+        for file, rows in self.rows.items():
+            for rule in (*self._rules(file, rows), *self._rules_of(file, rows)):
+                self._add_rows(file, *rule)
+            if file in ("images.txt", "depths.txt"):
+                self._check_files(file, rows)
+            elif session.tables[file].has_extra and file in ("trajectories.txt", ALIGNED):
+                self._check_covariances(file)
         if session.split == "map" and not self._has_errors:
             self._check_map_poses()
         order = {file: rank for rank, file in enumerate(session.tables)}
         self.problems.sort(key=lambda problem: (order.get(problem.file, -1), problem.line))
 
-    def _check_rows(self, file: str, rows: pd.DataFrame) -> None:
-        """Report malformed lines, duplicate keys, unknown ids and bad quaternions of any file."""
-        for line, message in self.session.tables[file].problems:
-            self._add(file, line, message)
+    def _rules(self, file: str, rows: pd.DataFrame) -> Iterator[Rule]:
+        """Yield what holds for any file: distinct keys, known ids, unit quaternions."""
+        key, sensors = key_of(file), self.rows["sensors.txt"]["sensor_id"]
         if file not in SIGNALS:
-            key = key_of(file)
             shown = ", ".join(f"{name} {{{name}!r}}" for name in key)
             again, same = rows.duplicated(key), rows.duplicated()
-            self._add_rows(file, rows[again & ~same], f"duplicate key ({shown}), with other values")
-            self._add_rows(file, rows[again & same], f"duplicate key ({shown}), same values: counts once", WARNING)
+            yield again & ~same, f"duplicate key ({shown}), with other values", ERROR
+            yield again & same, f"duplicate key ({shown}), same values: counts once", WARNING
         if "sensor_id" in rows:
-            unknown, severity = ~rows["sensor_id"].isin(self.sensors["sensor_id"]), ERROR
-            if file == "depths.txt":  # ids of rendered depth maps: <prefix>/<sensor id of the photograph>
-                unknown &= ~rows["sensor_id"].str.replace("^[^/]*/", "", regex=True).isin(self.sensors["sensor_id"])
+            unknown, severity = ~rows["sensor_id"].isin(sensors), ERROR
+            if file == "depths.txt":  # ids of rendered depth maps: <prefix>/<sensor id of the image>
+                unknown &= ~rows["sensor_id"].str.replace("^[^/]*/", "", regex=True).isin(sensors)
             elif file in (*SIGNALS, "gps.txt"):  # usable without a line in sensors.txt; one warning per sensor
                 unknown, severity = unknown & ~rows.duplicated("sensor_id"), WARNING
-            self._add_rows(file, rows[unknown], "unknown sensor {sensor_id!r}: not in sensors.txt", severity)
+            yield unknown, "unknown sensor {sensor_id!r}: not in sensors.txt", severity
         if "device_id" in rows:
-            message = "unknown device {device_id!r}: neither in rigs.txt nor in sensors.txt"
-            self._add_rows(file, rows[~self._is_device(rows)], message)
-        if file == "rigs.txt":
-            clash = rows["rig_id"].isin(self.sensors["sensor_id"])
-            self._add_rows(file, rows[clash], "rig {rig_id!r} has the name of a sensor")
+            unknown = ~rows["device_id"].isin(self.devices)
+            yield unknown, "unknown device {device_id!r}: neither in rigs.txt nor in sensors.txt", ERROR
         if "qw" in rows:
             off = np.abs(np.linalg.norm(rows[list(POSE_NAMES[:4])].to_numpy(np.float64), axis=1) - 1) > UNIT_TOLERANCE
-            self._add_rows(file, rows[off], "quaternion {qw} {qx} {qy} {qz} is not of length 1", WARNING)
+            yield off, "quaternion {qw} {qx} {qy} {qz} is not of length 1", WARNING
 
-    def _is_device(self, rows: pd.DataFrame) -> "pd.Series[bool]":
-        return rows["device_id"].isin(self.rig_ids) | rows["device_id"].isin(self.sensors["sensor_id"])
+    def _rules_of(self, file: str, rows: pd.DataFrame) -> Iterator[Rule]:
+        """Yield what holds for one file: how its rows fit those of other files."""
+        session, shown = self.session, "(timestamp {timestamp}, device {device_id!r})"
+        is_map, of_image = session.split == "map", session.subsession_of()
+        if file == "rigs.txt":
+            clash = rows["rig_id"].isin(self.rows["sensors.txt"]["sensor_id"])
+            yield clash, "rig {rig_id!r} has the name of a sensor", ERROR
+        elif file == "images.txt":
+            if is_map and session.trajectory is not None:
+                without = session.trajectory.index.find(times_of(session.images), session.device_ids) < 0
+                yield without, "image without pose (timestamp {timestamp}, sensor {sensor_id!r})", WARNING
+            if SUBSESSIONS in self.rows:
+                yield of_image == "", f"image {{image_path}} is in no subsession of {SUBSESSIONS}", WARNING
+        elif file in ("trajectories.txt", ALIGNED) and is_map:  # odometry of queries also has poses between images
+            images = KeyIndex(times_of(session.images), session.device_ids)
+            takes_images = rows["device_id"].isin(self.rig_ids) | rows["device_id"].isin(self.cameras)
+            without = takes_images & (images.find(times_of(rows), rows["device_id"]) < 0)
+            yield without, f"pose without image {shown}", WARNING
+        elif file == SUBSESSIONS:
+            long = rows["subsession"].map(lambda name: has_long_part(name, "subsession")).astype(bool)
+            yield long, "subsession {subsession!r} has a name too long for files", ERROR
+            yield ~rows["subsession"].isin(of_image), "subsession {subsession!r} has no images", WARNING
+        elif file in session.keyframe_files.values():
+            is_known = rows["device_id"].isin(self.devices)
+            without = np.array([not len(images) for images in session.rows_of_keyframes(rows)], bool)
+            yield is_known & without, f"keyframe without image {shown}", ERROR
+            if session.ground_truth is not None:
+                without = session.ground_truth.index.find(times_of(rows), rows["device_id"]) < 0
+                yield is_known & without, f"keyframe without ground truth {shown}", WARNING
 
     def _check_cameras(self) -> None:
         verdicts: dict[tuple[str, str], str | tuple[int, int]] = {}
-        rows = self.sensors[self.sensors["sensor_type"].isin(CAMERA_TYPES)]
-        for line, sensor, _, kind, params in rows.itertuples(name=None):
+        rows = self.rows["sensors.txt"]
+        for line, sensor, _, kind, params in rows[rows["sensor_type"].isin(CAMERA_TYPES)].itertuples(name=None):
             if (kind, params) not in verdicts:
                 try:
                     camera = parse_camera(kind, params)
@@ -226,97 +242,68 @@ class _SessionCheck:
                 self.sizes[sensor] = verdict
 
     def _check_files(self, file: str, rows: pd.DataFrame) -> None:
-        non_cameras = self.sensors[~self.sensors["sensor_type"].isin(CAMERA_TYPES)]["sensor_id"]
-        wrong = rows["sensor_id"].isin(non_cameras)
-        self._add_rows(file, rows[wrong], "sensor {sensor_id!r} of an image is not a camera")
-        path = rows.columns[2]
+        sensors, path = self.rows["sensors.txt"], rows.columns[2]
+        wrong = rows["sensor_id"].isin(sensors[~sensors["sensor_type"].isin(CAMERA_TYPES)]["sensor_id"])
+        self._add_rows(file, wrong, "sensor {sensor_id!r} of an image is not a camera")
         again = rows.duplicated(path) & ~rows.duplicated(key_of(file))
-        self._add_rows(file, rows[again], f"{RAW_DATA}/{{{path}}} is listed again, under another key")
-        outside = self.session.links_out(rows[path])
-        for row, target in outside.items():
-            shown = f"{RAW_DATA}/{rows[path].iloc[row]}"
-            self._add(file, rows.index[row], f"{shown} is a link to {target}, outside of the capture; {HOW_TO_ALLOW}")
+        self._add_rows(file, again, f"{RAW_DATA}/{{{path}}} is listed again, under another key")
         inside = np.ones(len(rows), bool)
-        inside[list(outside)] = False
+        for row, target in self.session.links_out(rows[path]).items():
+            inside[row], shown = False, f"{RAW_DATA}/{rows[path].iloc[row]} is a link to {target}"
+            self._add(file, rows.index[row], f"{shown}, outside of the capture; {HOW_TO_ALLOW}")
         exist = np.array([os.path.lexists(f"{self.session.path}/{RAW_DATA}/{name}") for name in rows[path]], bool)
-        missing = rows[~exist & inside]
-        self.missing[file] = len(missing)
-        self._add_rows(file, missing, f"missing file {RAW_DATA}/{{{path}}}")
+        self.missing[file] = int((~exist & inside).sum())
+        self._add_rows(file, ~exist & inside, f"missing file {RAW_DATA}/{{{path}}}")
         self._check_content(file, rows[exist & inside])
 
     def _check_content(self, file: str, rows: pd.DataFrame) -> None:
-        """Open the image files of rows, and compare the size of photographs with that of their camera."""
+        """Open the files of rows, and compare the size of images with that of their camera."""
         root, read = self.session.path / RAW_DATA, read_depth if file == "depths.txt" else read_image
-        is_photograph = rows["sensor_id"].isin(self.cameras) & (file == "images.txt")
+        is_image = rows["sensor_id"].isin(self.cameras) & (file == "images.txt")
 
         def fault(item: tuple[str, str, bool]) -> str:
-            path, sensor, photograph = item
+            path, sensor, of_camera = item
             try:
                 size = stored_size(root / path)
                 if self.deep:
                     read(root / path)
             except (ImageError, CaptureError) as error:
                 return str(error)
-            camera_size = self.sizes.get(sensor, size) if photograph else size
+            camera_size = self.sizes.get(sensor, size) if of_camera else size
             found, expected = (f"{width} x {height}" for width, height in (size, camera_size))
             return "" if size == camera_size else f"{path} has {found} pixels, its sensor {sensor!r} {expected}"
 
-        items = zip(rows[rows.columns[2]], rows["sensor_id"], is_photograph, strict=True)
+        items = zip(rows[rows.columns[2]], rows["sensor_id"], is_image, strict=True)
         workers = default_workers()
         for line, message in zip(rows.index, prefetch(fault, items, workers, ahead=4 * workers), strict=True):
             if message:
                 self._add(file, line, message)
 
-    def _check_trajectory(self, file: str, trajectory: Trajectory) -> None:
-        session, rows = self.session, self._rows(file)
-        images = KeyIndex(times_of(session.images), session.device_ids)
-        without = images.find(times_of(rows), rows["device_id"]) < 0
-        takes_images = rows["device_id"].isin(self.rig_ids) | rows["device_id"].isin(self.cameras)
-        if session.split == "map":  # odometry of queries also has poses between images
-            message = "pose without image (timestamp {timestamp}, device {device_id!r})"
-            self._add_rows(file, rows[takes_images & without], message, WARNING)
-        if session.tables[file].has_extra:
-            table = read_table(session.path / file, COLUMNS[file], strict=False, extra=True)
-            for line, extra in zip(table.lines, table.columns["extra"].to_pylist(), strict=True):
-                numbers = extra.split(",")
-                if extra and len(numbers) != 36:
-                    message = f"{len(numbers)} values after the pose, expected none or 36 (covariance)"
-                    self._add(file, line, message, WARNING)
-                elif extra and not np.isfinite(pd.to_numeric(pd.Series(numbers).str.strip(), errors="coerce")).all():
-                    self._add(file, line, "the covariance has values that are not finite numbers")
-
-    def _check_images_have_poses(self) -> None:
-        session = self.session
-        if session.trajectory is not None:
-            without = session.trajectory.index.find(times_of(session.images), session.device_ids) < 0
-            message = "image without pose (timestamp {timestamp}, sensor {sensor_id!r})"
-            self._add_rows("images.txt", self._rows("images.txt")[without], message, WARNING)
-        elif len(session.images):
-            self._add("trajectories.txt", 0, "file not found: images of a map session need poses")
-
-    def _check_keyframes(self, file: str, rows: pd.DataFrame) -> None:
-        session, known = self.session, self._is_device(rows)
-        without = np.array([not len(images) for images in session.rows_of_keyframes(rows)], bool)
-        shown = "(timestamp {timestamp}, device {device_id!r})"
-        self._add_rows(file, rows[known & without], f"keyframe without image {shown}")
-        if session.ground_truth is not None:
-            without = session.ground_truth.index.find(times_of(rows), rows["device_id"]) < 0
-            self._add_rows(file, rows[known & without], f"keyframe without ground truth {shown}", WARNING)
+    def _check_covariances(self, file: str) -> None:
+        table = read_table(self.session.path / file, COLUMNS[file], strict=False, extra=True)
+        for line, extra in zip(table.lines, table.columns["extra"].to_pylist(), strict=True):
+            numbers = extra.split(",")
+            if extra and len(numbers) != 36:
+                message = f"{len(numbers)} values after the pose, expected none or 36 (covariance)"
+                self._add(file, line, message, WARNING)
+            elif extra and not np.isfinite(pd.to_numeric(pd.Series(numbers).str.strip(), errors="coerce")).all():
+                self._add(file, line, "the covariance has values that are not finite numbers")
 
     def _check_map_poses(self) -> None:
         """Report implausible map poses: all in one place, all with one rotation, or all cameras moving backwards."""
-        session = self.session
+        session, file = self.session, "trajectories.txt"
         poses, rows = posed_photographs(session)
         order = np.lexsort((times_of(session.images)[rows], session.subsession_of(rows).astype(str)))
         poses, recording = poses[order], session.subsession_of(rows)[order]
         if len(poses) < 3:
             return
-        file = "trajectories.txt"
+        tree, extent = KDTree(poses[:, :3, 3]), float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))
+        together = int(tree.query_ball_point(poses[:, :3, 3], PLACE_SHARE * extent, return_length=True).max())
         if np.ptp(poses[:, :3, 3], axis=0).max() < SAME_PLACE_M:
             self._add(file, 0, f"all {len(poses)} images stand in one place: nothing can be triangulated")
         elif np.ptp(poses[:, :3, :3], axis=0).max() < 1e-9:
             self._add(file, 0, f"all {len(poses)} images have the same rotation: were rotations lost?", WARNING)
-        elif (together := _most_in_one_place(poses[:, :3, 3])) >= max(3, len(poses) / 2):
+        elif together >= max(3, len(poses) / 2):
             message = f"{together} of {len(poses)} images were taken from one place: nothing has parallax between them"
             self._add(file, 0, message, WARNING)
         steps = np.diff(poses[:, :3, 3], axis=0)
@@ -325,15 +312,6 @@ class _SessionCheck:
         if len(forward) >= WALK and np.median(forward) < -np.cos(np.radians(45)):
             message = "cameras move backwards: z axes must point forward (OpenCV); do they point backward (OpenGL)?"
             self._add(file, 0, message, WARNING)
-
-    def _check_subsessions(self) -> None:
-        of_image, rows = self.session.subsession_of(), self._rows(SUBSESSIONS)
-        long = rows["subsession"].map(lambda name: has_long_part(name, "subsession")).astype(bool)
-        self._add_rows(SUBSESSIONS, rows[long], "subsession {subsession!r} has a name too long for files")
-        empty = rows[~rows["subsession"].isin(of_image)]
-        self._add_rows(SUBSESSIONS, empty, "subsession {subsession!r} has no images", WARNING)
-        message = "image {image_path} is in no subsession of proc/subsessions.txt"
-        self._add_rows("images.txt", self._rows("images.txt")[of_image == ""], message, WARNING)
 
     def summary(self) -> pd.DataFrame:
         """Return a table [what, count, details] of texts."""
@@ -355,18 +333,17 @@ class _SessionCheck:
         span = f"{sizes.min()} to {sizes.max()}" if sizes.nunique() > 1 else f"{sizes.min()}"
         add("rigs", None if session.rigs is None else len(sizes), f"{span} sensors each" if len(sizes) else "")
         for what, trajectory in (("poses", session.trajectory), ("ground truth", session.ground_truth)):
-            note = ""
-            if what == "poses" and trajectory is not None and session.split != "map":
-                note = "odometry of the device, not used as ground truth"
-            elif what == "ground truth" and trajectory is None and session.split == "query":
-                note = f"no {ALIGNED}: these queries cannot be evaluated"
-            elif what == "ground truth" and trajectory is not None and trajectory is session.trajectory:
-                note = "from trajectories.txt"
             if trajectory is None:
-                add(what, None, note)
-            else:
-                posed = np.sum(trajectory.index.find(times, session.device_ids) >= 0)
-                add(what, len(trajectory), f"{posed:,} of {len(times):,} images have one", note)
+                lacks_truth = what == "ground truth" and session.split == "query"
+                add(what, None, f"no {ALIGNED}: these queries cannot be evaluated" if lacks_truth else "")
+                continue
+            posed = np.sum(trajectory.index.find(times, session.device_ids) >= 0)
+            note = ""
+            if what == "poses" and session.split != "map":
+                note = "odometry of the device, not used as ground truth"
+            elif what == "ground truth" and trajectory is session.trajectory:
+                note = "from trajectories.txt"
+            add(what, len(trajectory), f"{posed:,} of {len(times):,} images have one", note)
         if session.split == "map" and not self._has_errors and len(posed_photographs(session)[1]):
             add("up in the world", None, estimate_world_up([session]).reason)
         add("depth maps", None if session.depths is None else len(session.depths), missing("depths.txt"))
@@ -380,24 +357,16 @@ class _SessionCheck:
         shown = [f"{name} ({images.get(name, 0):,} images)" for name in session.subsessions[:6]]
         add("subsessions", len(session.subsessions), *shown, "..." if len(session.subsessions) > 6 else "")
         for name, file in session.keyframe_files.items():
-            keys = self._rows(file)
-            add(f"keyframes {name}", len(keys), _count(keys["device_id"].nunique(), "device"))
+            add(f"keyframes {name}", len(self.rows[file]), _count(self.rows[file]["device_id"].nunique(), "device"))
         if (session.path / "pointclouds.txt").exists():
             add("point clouds", None, "pointclouds.txt is not used")
         return pd.DataFrame(rows, columns=["what", "count", "details"])
 
     def _camera_models(self) -> list[str]:
-        params = self.sensors["extra"][self.sensors["sensor_type"] == "camera"]
-        heads = params.str.split(",", n=3).str[:3].map(lambda words: " ".join(word.strip() for word in words))
-        counts = heads.value_counts()
+        params = self.rows["sensors.txt"].query("sensor_type == 'camera'")["extra"]
+        counts = params.str.split(",", n=3).map(lambda words: " ".join(map(str.strip, words[:3]))).value_counts()
         return [*(f"{count:,} {head}" for head, count in counts.head(4).items()), "..." if len(counts) > 4 else ""]
 
 
 def _count(number: int, what: str) -> str:
     return f"{number:,} {what}" + ("" if number == 1 else "s")
-
-
-def _most_in_one_place(centers: Floats) -> int:
-    """Return the largest number of camera centers (N, 3) that stand in one place."""
-    tree, extent = KDTree(centers), float(np.linalg.norm(np.ptp(centers, axis=0)))
-    return int(tree.query_ball_point(centers, PLACE_SHARE * extent, return_length=True).max())

@@ -30,10 +30,9 @@ from toolkit.geometry import Floats, Ints
 
 log = logging.getLogger(__name__)
 
+# Largest time between a photograph and the depth map of another sensor: half the period of the slowest, at 5 Hz.
 MAX_OFFSET_US = 100_000
-"""Largest time between a photograph and the depth map of another sensor: half the period of the slowest, at 5 Hz."""
-MAX_GAP_US = 1_000_000
-"""Largest time between two poses of a sensor to interpolate between them."""
+MAX_GAP_US = 1_000_000  # largest time between two poses of a sensor to interpolate between them
 _MOST_POINTS = 30_000  # per depth map; enough for a few hundred features
 _HIDDEN = 1.1  # a point deeper than its nearest neighbor by this factor is occluded, or on an edge
 _CELL = 1.5  # width of a cell, in point spacings; only the nearest point of a cell is visible
@@ -46,14 +45,10 @@ _KEPT = 32  # photographs whose depth is cached
 class SeenDepth:
     """Depth at some pixels of a photograph."""
 
-    pixels: Floats
-    """(P, 2) pixels of the photograph, in row order from the top."""
-    depth_m: Floats
-    """(P,) depth along the photograph's optical axis, meters."""
-    cell_px: float = 1.0
-    """Width of the grid cells, pixels; each cell has at most one point."""
-    reason: str = ""
-    """Which depth maps were left out and why; without points, why there are none."""
+    pixels: Floats  # (P, 2) pixels of the photograph, in row order from the top
+    depth_m: Floats  # (P,) depth along the photograph's optical axis, meters
+    cell_px: float = 1.0  # width of the grid cells, pixels; each cell has at most one point
+    reason: str = ""  # which depth maps were left out and why; without points, why there are none
 
     def __len__(self) -> int:
         return len(self.depth_m)
@@ -98,12 +93,9 @@ def lifted(camera: pycolmap.Camera, pixels: Floats, depth_m: Floats) -> Floats:
 class _DepthMap:
     """A depth map that belongs to a photograph."""
 
-    path: str
-    """Path relative to raw_data/."""
-    camera: pycolmap.Camera | None
-    """Camera of the depth map; None: the photograph's camera, possibly resized."""
-    cam_from_depth: Floats
-    """(4, 4) pose of the depth sensor in the photograph's camera."""
+    path: str  # path relative to raw_data/
+    camera: pycolmap.Camera | None  # camera of the depth map; None: the photograph's camera, possibly resized
+    cam_from_depth: Floats  # (4, 4) pose of the depth sensor in the photograph's camera
 
 
 class DepthMaps:
@@ -111,20 +103,17 @@ class DepthMaps:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._seen = lru_cache(_KEPT)(self._see)
+        self.of = lru_cache(_KEPT)(self._see)
         self._tracks: dict[str, tuple[Ints, Floats]] = {}
         self._lock = Lock()
         self._logged: set[str] = set()
 
-    def of(self, row: int) -> SeenDepth:
+    def _see(self, row: int) -> SeenDepth:
         """Return the depth in a photograph, given as a row of `Session.images`.
 
         Each depth sensor that belongs to the camera contributes its depth map nearest in time, within `MAX_OFFSET_US`.
         A depth map that cannot be read or does not fit its sensor is left out; the reason is logged once.
         """
-        return self._seen(row)
-
-    def _see(self, row: int) -> SeenDepth:
         image = self._session.images.iloc[row]
         camera = self._session.camera(str(image["sensor_id"]))
         sources, reasons = self._sources(row, int(image["timestamp"]), str(image["sensor_id"]))
@@ -132,16 +121,14 @@ class DepthMaps:
         for source in sources:
             try:
                 points_of_map, spacing_px = self._points(source, camera)
+                points, spacing = [*points, points_of_map], max(spacing, spacing_px)
             except CaptureError as error:
                 reasons.append(str(error))
-                continue
-            points.append(points_of_map)
-            spacing = max(spacing, spacing_px)
         with self._lock:
-            new = [reason for reason in reasons if reason not in self._logged]
-            self._logged.update(new)
-        for reason in new:
-            log.warning("left out: %s", reason)
+            for reason in dict.fromkeys(reasons):
+                if reason not in self._logged:
+                    log.warning("left out: %s", reason)
+            self._logged.update(reasons)
         return _visible(np.concatenate(points), camera, max(1.0, _CELL * spacing), "; ".join(reasons))
 
     @cached_property
@@ -222,8 +209,7 @@ class DepthMaps:
             return None
         share = (timestamp - times[after - 1]) / (times[after] - times[after - 1])
         rotation = Slerp([0, 1], Rotation.from_matrix(poses[after - 1 : after + 1, :3, :3]))(share).as_matrix()
-        position = (1 - share) * poses[after - 1, :3, 3] + share * poses[after, :3, 3]
-        return geometry.make_pose(rotation, position)
+        return geometry.make_pose(rotation, (1 - share) * poses[after - 1, :3, 3] + share * poses[after, :3, 3])
 
     def _points(self, source: _DepthMap, photograph: pycolmap.Camera) -> tuple[Floats, float]:
         """Return the points (P, 3) of a depth map in the photograph's camera, and their spacing in its pixels.
@@ -237,10 +223,8 @@ class DepthMaps:
         camera = source.camera or photograph
         resized = source.camera is None and abs(width - height * camera.width / camera.height) <= 1
         if not resized and (width, height) != (camera.width, camera.height):
-            raise CaptureError(
-                f"Depth map {path}: found {width} x {height} pixels, expected {camera.width} x {camera.height} as in "
-                "sensors.txt" + (", or a smaller size of that aspect ratio." if source.camera is None else ".")
-            )
+            expected = f"{camera.width} x {camera.height}" + (", or that aspect ratio" if source.camera is None else "")
+            raise CaptureError(f"Depth map {path}: found {width} x {height} pixels, expected {expected}.")
         step = int(np.ceil(np.sqrt(max(np.count_nonzero(depth) / _MOST_POINTS, 1.0))))
         y, x = np.nonzero(depth[step // 2 :: step, step // 2 :: step])
         y, x = y * step + step // 2, x * step + step // 2

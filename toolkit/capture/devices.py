@@ -10,12 +10,11 @@ import os
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 from toolkit.files import environment_variable
 
-EXTRA_DEVICES = "TOOLKIT_EXTRA_DEVICES"
-"""Environment variable with the rows that a manifest adds, in JSON."""
+EXTRA_DEVICES = "TOOLKIT_EXTRA_DEVICES"  # environment variable with the rows that a manifest adds, in JSON
 SPLITS = ("map", "query")
 
 
@@ -23,12 +22,9 @@ SPLITS = ("map", "query")
 class DeviceKind:
     """One kind of device."""
 
-    key: str
-    """Name in session folders, file names and tables."""
-    label: str
-    """Name in figures and the report."""
-    color: str
-    """Color in figures, #rrggbb."""
+    key: str  # name in session folders, file names and tables
+    label: str  # name in figures and the report
+    color: str  # color in figures, #rrggbb
     sessions: Mapping[str, str] = field(default_factory=dict)
     """Name of the session folder by split, for data sets that do not name it `<key>_<split>`."""
 
@@ -48,10 +44,8 @@ def kinds() -> tuple[DeviceKind, ...]:
     """Return the rows of the table, including those that the manifest of this run adds or replaces."""
     rows = {kind.key: kind for kind in TABLE}
     for row in json.loads(os.environ.get(EXTRA_DEVICES, "[]")):
-        key = row["key"]
-        default = rows.get(key) or DeviceKind(key, key, _color_of_other(key))
-        label, color = row.get("label") or default.label, row.get("color") or default.color
-        rows[key] = DeviceKind(key, label, color, row.get("sessions") or default.sessions)
+        default = rows.get(row["key"]) or DeviceKind(row["key"], row["key"], _color_of_other(row["key"]))
+        rows[row["key"]] = replace(default, **{name: value for name, value in row.items() if value})
     return tuple(rows.values())
 
 

@@ -27,10 +27,8 @@ class Capture:
             raise CaptureError(f"No such capture folder: {self.path}. Expected a folder that contains `sessions/`.")
         self._root = self.path / "sessions"
         if not self._root.is_dir():
-            raise CaptureError(
-                f"{self.path} is not a capture: it has no folder `sessions`. Expected "
-                f"{self.path.name}/sessions/<device>_<map|query>/images.txt."
-            )
+            expected = f"{self.path.name}/sessions/<device>_<map|query>/images.txt"
+            raise CaptureError(f"{self.path} is not a capture: it has no folder `sessions`. Expected {expected}.")
         require_name(self.name, "capture", self.path.parent)
         self._folders: dict[str, Path] = {}
         for folder in sorted(self._root.iterdir()):
@@ -42,10 +40,8 @@ class Capture:
                 self._folders[name] = folder
         self.session_ids = sorted(self._folders)
         if not self.session_ids:
-            raise CaptureError(
-                f"{self._root} contains no session: no folder in it has a sensors.txt or images.txt. "
-                "Expected folders such as ios_map and hl_query."
-            )
+            found = "no folder in it has a sensors.txt or images.txt"
+            raise CaptureError(f"{self._root} contains no session: {found}. Expected e.g. ios_map and hl_query.")
         self._sessions: dict[str, Session] = {}
 
     @classmethod
@@ -97,15 +93,11 @@ class Capture:
         if device in ("all", "auto") and present:
             return present
         if not present:
-            raise CaptureError(
-                f"{self.path}: no {split} session. Expected sessions/<device>_{split}, as made by "
-                f"`python -m toolkit import ... --split {split}`."
-            )
+            expected = f"sessions/<device>_{split}, as made by `python -m toolkit import ... --split {split}`"
+            raise CaptureError(f"{self.path}: no {split} session. Expected {expected}.")
         if device not in present:
-            raise CaptureError(
-                f"No {split} session of device {device!r} in {self.path}. "
-                f"Devices with one: {', '.join(present) or 'none'} (or `all`)."
-            )
+            known = f"Devices with one: {', '.join(present)} (or `all`)"
+            raise CaptureError(f"No {split} session of device {device!r} in {self.path}. {known}.")
         return [device]
 
     def pairs(
@@ -134,16 +126,14 @@ class Capture:
 
     def __getitem__(self, session_id: str) -> Session:
         if session_id not in self.session_ids:
-            raise CaptureError(
-                f"Capture {self.path} has no session {session_id!r}; known: {', '.join(self.session_ids)}."
-            )
+            known = ", ".join(self.session_ids)
+            raise CaptureError(f"Capture {self.path} has no session {session_id!r}; known: {known}.")
         if session_id not in self._sessions:
             try:
                 self._sessions[session_id] = Session.open(self._folders[session_id])
             except OSError as error:
-                raise CaptureError(
-                    f"{self._folders[session_id]}: {error.filename or 'a file'} cannot be read ({error.strerror})."
-                ) from None
+                fault = f"{error.filename or 'a file'} cannot be read ({error.strerror})"
+                raise CaptureError(f"{self._folders[session_id]}: {fault}.") from None
         return self._sessions[session_id]
 
     def usable(self, split: str) -> list[Session]:
@@ -161,6 +151,3 @@ class Capture:
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.session_ids)
-
-    def __len__(self) -> int:
-        return len(self.session_ids)

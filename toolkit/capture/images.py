@@ -1,11 +1,15 @@
-"""Read image files, with errors that distinguish missing from unreadable files; also thread counts for such loops."""
+"""Read image files and their EXIF tags, with errors that distinguish missing from unreadable files.
+
+Also numbers of threads for loops over images, and a guess of intrinsics from EXIF.
+"""
 
 import os
 import stat
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -13,6 +17,7 @@ from typing import Any, BinaryIO, TypeVar
 import cv2
 import numpy as np
 import PIL.Image
+import pycolmap
 from numpy.typing import NDArray
 from PIL import JpegImagePlugin, PngImagePlugin
 
@@ -21,14 +26,10 @@ from toolkit.errors import ImageError
 T = TypeVar("T")
 R = TypeVar("R")
 
-WORKERS = "TOOLKIT_WORKERS"
-"""Environment variable with the number of threads that this process may use."""
-THREAD_BYTES = 1 << 29
-"""Memory to reserve for each thread, bytes: SIFT of a photograph of 4000 x 3000 pixels takes 460 MB."""
-MOST_BYTES = 1 << 30
-"""Largest size of an image file, bytes."""
-MOST_PIXELS = 1 << 28
-"""Largest number of pixels of a decoded image: 268 million, 0.8 GB in color. A tiny file can declare many more."""
+WORKERS = "TOOLKIT_WORKERS"  # environment variable with the number of threads that this process may use
+THREAD_BYTES = 1 << 29  # memory to reserve for each thread, bytes: SIFT of 4000 x 3000 pixels takes 460 MB
+MOST_BYTES = 1 << 30  # largest size of an image file, bytes
+MOST_PIXELS = 1 << 28  # of a decoded image: 268 million, 0.8 GB in color; a tiny file can declare many more
 # JPEG and PNG bypass `PIL.Image.open`, whose limit of pixels is below the resolution of recent phones.
 _HEADER_READERS: dict[bytes, Callable[[Any], PIL.Image.Image]] = {
     b"\xff\xd8": JpegImagePlugin.JpegImageFile,
@@ -38,6 +39,13 @@ _HEADER_READERS: dict[bytes, Callable[[Any], PIL.Image.Image]] = {
 _REDUCED = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2.IMREAD_REDUCED_COLOR_2}
 _CGROUPS = Path("/sys/fs/cgroup")  # file names differ between versions 2 and 1
 HEADER_ERRORS = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
+# Numbers of the EXIF tags, and the length in millimeters of each value of FocalPlaneResolutionUnit.
+ORIENTATION, _EXIF, _TIME, _SUBSECOND = 0x0112, 0x8769, 0x9003, 0x9291
+_FOCAL_MM, _FOCAL_35MM, _WIDTH = 0x920A, 0xA405, 0xA002
+_PLANE_X, _PLANE_UNIT = 0xA20E, 0xA210
+_UNIT_MM = {0.0: 25.4, 2.0: 25.4, 3.0: 10.0, 4.0: 1.0}  # 0, a missing tag, means inches
+NO_FILE = "no such file"
+_FILM_DIAGONAL_MM = float(np.hypot(36, 24))
 
 
 def read_file(path: str | Path) -> bytes:
@@ -57,8 +65,7 @@ def _open(path: str | Path) -> Iterator[BinaryIO]:
         if not stat.S_ISREG(status.st_mode):  # opening a pipe blocks forever, reading a device never ends
             raise ImageError(f"Image cannot be read: {path} is a folder, a pipe or a device, expected a file")
         if status.st_size > MOST_BYTES:
-            size = f"{status.st_size:,} bytes, expected at most {MOST_BYTES:,}"
-            raise ImageError(f"Image cannot be read: {path} has {size}")
+            raise ImageError(f"Image cannot be read: {path} has more than {MOST_BYTES:,} bytes")
         with open(path, "rb") as stream:
             yield stream
     except FileNotFoundError:
@@ -75,7 +82,7 @@ def stored_size(path: str | Path) -> tuple[int, int]:
     """
     with _open(path) as stream:
         try:
-            return _header_size(stream)
+            return open_lazily(stream, np.inf).size
         except HEADER_ERRORS as error:
             raise ImageError(f"Image cannot be decoded ({error}): {path}") from None
 
@@ -90,10 +97,6 @@ def open_lazily(stream: BinaryIO, most_pixels: float = MOST_PIXELS) -> PIL.Image
     return image
 
 
-def _header_size(stream: BinaryIO) -> tuple[int, int]:
-    return open_lazily(stream, np.inf).size
-
-
 def decode(path: str | Path, flags: int, least_side: int | None = None, longest: int | None = None) -> NDArray[Any]:
     """Return the pixels of an image file as OpenCV decodes it with `flags`.
 
@@ -104,35 +107,23 @@ def decode(path: str | Path, flags: int, least_side: int | None = None, longest:
         ImageError: see `read_file`; or the file is not an image, is truncated, or has more than `MOST_PIXELS` pixels.
     """
     data = read_file(path)
+    size = 0, 0
     try:
-        width, height = _header_size(BytesIO(data))
-    except PIL.Image.DecompressionBombError as error:
-        raise ImageError(f"Image cannot be decoded ({error}): {path}") from None
-    except HEADER_ERRORS:
-        width = height = 0  # OpenCV decides whether it is an image
-    if width * height > MOST_PIXELS:
-        raise ImageError(f"Image cannot be decoded ({width} x {height} pixels, more than {MOST_PIXELS:,}): {path}")
-    if data.startswith(b"\xff\xd8"):  # reducing saves time only for JPEG
-        if least_side is not None:
-            flags |= _reduced(width, height, min(width, height) // least_side)
-        elif longest is not None:
-            flags |= _reduced(width, height, max(width, height) // longest)
-    try:
+        with suppress(*HEADER_ERRORS[:-1]):  # OpenCV decides whether it is an image
+            size = open_lazily(BytesIO(data), np.inf).size
+        if size[0] * size[1] > MOST_PIXELS:
+            raise ValueError(f"{size[0]} x {size[1]} pixels, more than {MOST_PIXELS:,}")
+        if data.startswith(b"\xff\xd8") and (least_side or longest):  # reducing saves time only for JPEG
+            most = min(size) // least_side if least_side else max(size) // (longest or 1)
+            # With a remainder, the last row and column would cover fewer pixels and shift all others.
+            fitting = (flag for factor, flag in _REDUCED.items() if factor <= most and not np.any(np.mod(size, factor)))
+            flags |= next(fitting, 0)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    except cv2.error as error:
-        raise ImageError(f"Image cannot be decoded ({error.err}): {path}") from None
+    except (ValueError, cv2.error, PIL.Image.DecompressionBombError) as error:
+        raise ImageError(f"Image cannot be decoded ({getattr(error, 'err', error)}): {path}") from None
     if image is None:
         raise ImageError(f"Image cannot be decoded ({len(data)} bytes; expected a whole JPEG or PNG): {path}")
     return np.asarray(image)
-
-
-def _reduced(width: int, height: int, most: int) -> int:
-    """Return the OpenCV flag that decodes a JPEG of this size reduced by at most this factor; 0 for full size."""
-    for factor, flag in _REDUCED.items():
-        # With a remainder, the last row and column would cover fewer pixels and shift all others.
-        if width % factor == height % factor == 0 and factor <= most:
-            return flag
-    return 0
 
 
 def read_image(
@@ -243,3 +234,74 @@ def prefetch(function: Callable[[T], R], items: Iterable[T], workers: int = 2, a
         for future in pending:
             future.cancel()
         pool.shutdown(wait=True)
+
+
+def is_file(path: Path) -> bool:
+    """Tell whether a file exists; False for a name that is too long for a file."""
+    return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises for too long a name
+
+
+def read_header(path: Path) -> tuple[tuple[int, int], dict[int, Any]]:
+    """Return the stored width and height of an image, and its EXIF tags by number.
+
+    Raises:
+        ImageError: the file is missing, not an image, or has more than `images.MOST_PIXELS` pixels.
+    """
+    if not is_file(path):
+        raise ImageError(NO_FILE)
+    try:
+        with open(path, "rb") as stream:
+            image = open_lazily(stream)
+            exif = image.getexif()
+            return image.size, {**exif, **exif.get_ifd(_EXIF)}
+    except HEADER_ERRORS as error:
+        raise ImageError(f"cannot be read as an image ({error})") from None
+
+
+def time_taken(exif: Mapping[int, Any]) -> int | None:
+    """Return the time on the camera's clock, microseconds since 1970 in an unknown time zone; None without a tag."""
+    try:
+        taken = datetime.strptime(str(exif[_TIME]), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
+    except (KeyError, ValueError):
+        return None
+    digits = str(exif.get(_SUBSECOND, "")).strip()
+    return int(taken.timestamp()) * 10**6 + (int(f"{digits:0<6}"[:6]) if digits.isdecimal() else 0)
+
+
+def read_number(exif: Mapping[int, Any], tag: int) -> float:
+    """Return the value of a tag as a number; 0 if it is missing, not a number or not finite."""
+    try:
+        number = float(exif.get(tag, 0))
+    except (TypeError, ValueError, ZeroDivisionError):
+        return 0.0
+    return number if np.isfinite(number) else 0.0
+
+
+def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
+    """Guess the intrinsics of an image from its EXIF tags: no distortion, principal point in the image center.
+
+    FocalLengthIn35mmFilm refers to the diagonal of 36 mm x 24 mm film (CIPA DC-008). Without that tag, the focal length
+    is FocalLength times FocalPlaneXResolution, scaled if the image was resized later.
+
+    Returns:
+        A SIMPLE_PINHOLE camera, and a phrase that names the tags used.
+
+    Raises:
+        ImageError: the image cannot be read, or has no focal length in EXIF.
+    """
+    (width, height), exif = read_header(path)
+    focal_mm, film_mm = read_number(exif, _FOCAL_MM), read_number(exif, _FOCAL_35MM)
+    plane_x, unit_mm = read_number(exif, _PLANE_X), _UNIT_MM.get(read_number(exif, _PLANE_UNIT))
+    if film_mm > 0:
+        focal_px, how = film_mm * np.hypot(width, height) / _FILM_DIAGONAL_MM, "FocalLengthIn35mmFilm"
+    elif focal_mm > 0 and plane_x > 0 and unit_mm:
+        stored = read_number(exif, _WIDTH)
+        focal_px = focal_mm * plane_x / unit_mm * (width / stored if stored > 0 else 1.0)
+        how = "FocalLength and FocalPlaneXResolution"
+    else:
+        such_as = f"'SIMPLE_PINHOLE,{width},{height},FOCAL_PX,{width / 2:g},{height / 2:g}'"
+        options = f"--camera 'MODEL,W,H,...', such as {such_as}, with --cameras, or in the table"
+        raise ImageError(f"no focal length in EXIF: give the intrinsics with {options}")
+    params = [float(focal_px), width / 2, height / 2]
+    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
+    return camera, f"a guess from EXIF ({how}), without distortion"

@@ -23,25 +23,22 @@ from toolkit.capture.trajectory import Trajectory
 from toolkit.geometry import Floats, Ints
 
 Bools = NDArray[np.bool_]
+Images = tuple[Session, Ints]
+"""Images of the map, N, or queries, Q: their session, and their rows in it."""
 
-_BLOCK = 1 << 24
-"""Pairs of a query and a map image that are processed at a time."""
-_FAINTEST_DBM = -100.0
-"""Zero of the scale of strengths: weaker signals are hardly received."""
+_BLOCK = 1 << 24  # pairs of a query and a map image that are processed at a time
+_FAINTEST_DBM = -100.0  # zero of the scale of strengths: weaker signals are hardly received
+# Radius that contains the true position in 99 % of cases if errors are normal, in stated accuracies (68 % radii).
 _ACCURACIES = 2.0
-"""Radius that contains the true position in 99 % of cases if errors are normal, in stated accuracies (68 % radii)."""
 
 
 @dataclass(frozen=True)
 class Masks:
     """Which of N map images each of Q queries may retrieve; N / 8 bytes per distinct mask."""
 
-    count: int
-    """N, the number of map images."""
-    bits: NDArray[np.uint8]
-    """(M, N / 8) the distinct masks, the first map image in the lowest bit."""
-    which: Ints
-    """(Q,) row in `bits` of each query's mask; -1: all map images are allowed."""
+    count: int  # N, the number of map images
+    bits: NDArray[np.uint8]  # (M, N / 8) the distinct masks, the first map image in the lowest bit
+    which: Ints  # (Q,) row in `bits` of each query's mask; -1: all map images are allowed
 
     @classmethod
     def of(cls, masks: Iterable[Bools], which: Ints, count: int) -> "Masks":
@@ -121,51 +118,39 @@ def near(world_from_cams: Floats, world_from_cam: Floats, distance_m: float, ang
 
 
 def pose_masks(
-    poses: Trajectory,
-    map_session: Session,
-    map_rows: Ints,
-    query_session: Session,
-    query_rows: Ints,
-    distance_m: float,
-    angle_deg: float,
+    poses: Trajectory, map_images: Images, query_images: Images, distance_m: float, angle_deg: float
 ) -> Masks:
     """Return masks of the map images that are `near` the roughly known poses of query images.
 
     Args:
         poses: world_from_device of the query rigs, or else of their cameras, in the map's frame.
-        map_rows, query_rows: rows of the images of the two sessions, (N,) and (Q,).
     """
-    times, sensors = times_of(query_session.images)[query_rows], query_session.images["sensor_id"].iloc[query_rows]
-    world_from_cams = poses.lookup(times, query_session.device_ids[query_rows]) @ query_session.rig_from_cam(query_rows)
-    of_camera = poses.lookup(times, sensors)
-    unknown = np.isnan(world_from_cams[:, 0, 0])
-    world_from_cams[unknown] = of_camera[unknown]
-    which = np.where(np.isnan(world_from_cams[:, 0, 0]), -1, np.arange(len(query_rows)))
-    of_map = map_session.world_from_cam(map_rows)
+    session, rows = query_images
+    times, sensors = times_of(session.images)[rows], session.images["sensor_id"].iloc[rows]
+    of_rig = poses.lookup(times, session.device_ids[rows]) @ session.rig_from_cam(rows)
+    world_from_cams = np.where(np.isnan(of_rig[:, :1, :1]), poses.lookup(times, sensors), of_rig)
+    which = np.where(np.isnan(world_from_cams[:, 0, 0]), -1, np.arange(len(rows)))
+    of_map = map_images[0].world_from_cam(map_images[1])
     masks = (near(of_map, pose, distance_m, angle_deg)[None] for pose in world_from_cams)
-    return Masks.of(masks, which, len(map_rows))
+    return Masks.of(masks, which, len(of_map))
 
 
-def gps_masks(
-    map_session: Session, map_rows: Ints, query_session: Session, query_rows: Ints, margin_m: float, window_s: float
-) -> Masks:
+def gps_masks(map_images: Images, query_images: Images, margin_m: float, window_s: float) -> Masks:
     """Return masks of the map images whose GPS fixes are near those of query images.
 
     Two fixes are near if their distance is at most the margin plus twice both accuracies. A map image without a fix is
     allowed if the query is near any other map image.
 
     Args:
-        map_rows, query_rows: rows of the images of the two sessions, (N,) and (Q,).
         margin_m: largest distance between a query and a map image that show the same scene.
         window_s: largest time difference between an image and its fixes.
     """
-    count = len(map_rows)
-    map_fixes, query_fixes = _fixes(map_session), _fixes(query_session)
-    if map_fixes.empty or query_fixes.empty:
-        return Masks.of([], np.full(len(query_rows), -1), count)
-    origin = map_fixes.iloc[0]
-    map_means, map_which = _mean_fix(map_session, map_rows, map_fixes, origin, window_s)
-    query_means, which = _mean_fix(query_session, query_rows, query_fixes, origin, window_s)
+    count, fixes = len(map_images[1]), [_fixes(session) for session, _ in (map_images, query_images)]
+    if fixes[0].empty or fixes[1].empty:
+        return Masks.of([], np.full(len(query_images[1]), -1), count)
+    origin = fixes[0].iloc[0]
+    map_means, map_which = _mean_fix(map_images, fixes[0], origin, window_s)
+    query_means, which = _mean_fix(query_images, fixes[1], origin, window_s)
 
     def blocks() -> Iterator[Bools]:
         for block in _blocks(query_means, max(count, len(map_means))):
@@ -178,15 +163,11 @@ def gps_masks(
 
 def _fixes(session: Session) -> pd.DataFrame:
     """Return the rows of gps.txt that have a fix."""
-    table = session.gps
-    if table is None:
-        return pd.DataFrame({"timestamp": []})
+    table = session.gps if session.gps is not None else pd.DataFrame({"horizontal_accuracy_m": []})
     return table[table["horizontal_accuracy_m"] >= 0].reset_index(drop=True)
 
 
-def _mean_fix(
-    session: Session, rows: Ints, table: pd.DataFrame, origin: "pd.Series[float]", window_s: float
-) -> tuple[Floats, Ints]:
+def _mean_fix(images: Images, table: pd.DataFrame, origin: "pd.Series[float]", window_s: float) -> tuple[Floats, Ints]:
     """Return mean fixes (S, 3), meters east and north of `origin` and accuracy, and the mean's row for each image."""
     names = ["longitude_deg", "latitude_deg"]
     offsets = np.radians((table[names] - origin[names].astype(float) + 180) % 360 - 180).to_numpy()
@@ -196,33 +177,30 @@ def _mean_fix(
     along = across * (1 - 0.00669437999014) / (1 - 0.00669437999014 * sine**2)
     meters = offsets * [across * np.sqrt(1 - sine**2), along]
     fixes = np.column_stack([meters, table["horizontal_accuracy_m"]])
-    within, which = _within(session, rows, table, window_s)
+    within, which = _within(images, table, window_s)
     return within @ fixes / np.maximum(within.sum(axis=1), 1)[:, None], which
 
 
-def radio_masks(
-    map_session: Session, map_rows: Ints, query_session: Session, query_rows: Ints, least: int, window_s: float
-) -> Masks:
+def radio_masks(map_images: Images, query_images: Images, least: int, window_s: float) -> Masks:
     """Return masks of the map images with the radio signals most similar to those at query images.
 
     The similarity is the cosine between the vectors of strengths of all emitters, in dB above -100 dBm, 0 for an
     emitter that was not received. A map image without a scan uses the scan of the nearest map image that has one.
 
     Args:
-        map_rows, query_rows: rows of the images of the two sessions, (N,) and (Q,); map images have poses.
+        map_images, query_images: N and Q images; map images have poses.
         least: number of map images to allow: fewer if fewer received any of the query's emitters, more if some are
             equally similar.
         window_s: largest time difference between an image and its scans.
     """
-    count = len(map_rows)
-    map_signals, query_signals = _signals(map_session), _signals(query_session)
+    count, map_signals = len(map_images[1]), _signals(map_images[0])
     emitters = pc.unique(as_strings(map_signals["emitter"]))
-    map_strengths, map_which = _strengths(map_session, map_rows, map_signals, emitters, window_s)
-    query_strengths, which = _strengths(query_session, query_rows, query_signals, emitters, window_s)
+    map_strengths, map_which = _strengths(map_images, map_signals, emitters, window_s)
+    query_strengths, which = _strengths(query_images, _signals(query_images[0]), emitters, window_s)
     known = map_which >= 0
     if not known.any():
-        return Masks.of([], np.full(len(query_rows), -1), count)
-    centers = map_session.world_from_cam(map_rows)[:, :3, 3]
+        return Masks.of([], np.full(len(which), -1), count)
+    centers = map_images[0].world_from_cam(map_images[1])[:, :3, 3]
     map_which[~known] = map_which[known][cKDTree(centers[known]).query(centers[~known])[1]]
     images = np.bincount(map_which, minlength=map_strengths.shape[0])
 
@@ -253,14 +231,12 @@ def _signals(session: Session) -> pd.DataFrame:
     return pd.concat(tables[1:] or tables, ignore_index=True)
 
 
-def _strengths(
-    session: Session, rows: Ints, signals: pd.DataFrame, emitters: pa.Array, window_s: float
-) -> tuple[csr_array, Ints]:
+def _strengths(images: Images, signals: pd.DataFrame, emitters: pa.Array, window_s: float) -> tuple[csr_array, Ints]:
     """Return mean strengths (S, E) of emitters, scaled to unit rows, and the row of each image, -1 without a scan."""
     codes = codes_of(as_strings(signals["emitter"]), emitters)
     signals, codes = signals[codes >= 0], codes[codes >= 0]
     strength = np.maximum(signals["rssi_dbm"].to_numpy(np.float64) - _FAINTEST_DBM, 1)
-    within, which = _within(session, rows, signals, window_s)
+    within, which = _within(images, signals, window_s)
     sums, times = (
         within @ csr_array((values, codes, np.arange(len(codes) + 1)), (len(codes), len(emitters)))
         for values in (strength, np.ones(len(codes)))
@@ -273,7 +249,7 @@ def _strengths(
     return sums, which
 
 
-def _within(session: Session, rows: Ints, table: pd.DataFrame, window_s: float) -> tuple[csr_array, Ints]:
+def _within(images: Images, table: pd.DataFrame, window_s: float) -> tuple[csr_array, Ints]:
     """Return which of L lines of a table belong to an image: those of its recording within the time window.
 
     A line belongs to the recording whose name its sensor id begins with; without such a name, to all recordings.
@@ -282,6 +258,7 @@ def _within(session: Session, rows: Ints, table: pd.DataFrame, window_s: float) 
         A matrix (S, L) with one row per distinct set of lines, 1 for the lines in it; and the row of each image,
         -1 without any line.
     """
+    session, rows = images
     names = sorted(session.subsessions, key=len)
     sensors, of_line = as_strings(table["sensor_id"]), np.full(len(table), -1)
     for number, name in enumerate(names):
@@ -292,12 +269,11 @@ def _within(session: Session, rows: Ints, table: pd.DataFrame, window_s: float) 
     image_times, window = times_of(session.images)[rows], round(window_s * 1e6)
     spans = np.zeros((len(rows), 2, 2), np.int64)  # lines of the image's recording, and lines of no recording
     for number in np.unique(of_image):
-        images = np.flatnonzero(of_image == number)
+        here = np.flatnonzero(of_image == number)
         for span, recording in enumerate((number, -1)):
             first, last = np.searchsorted(of_line, [recording, recording + 1])
-            begin, end = image_times[images] - window, image_times[images] + window
-            spans[images, span, 0] = first + np.searchsorted(times[first:last], begin)
-            spans[images, span, 1] = first + np.searchsorted(times[first:last], end, side="right")
+            spans[here, span, 0] = first + np.searchsorted(times[first:last], image_times[here] - window)
+            spans[here, span, 1] = first + np.searchsorted(times[first:last], image_times[here] + window, side="right")
     spans[of_image < 0, 0] = 0
     spans[spans[..., 0] == spans[..., 1]] = 0
     distinct, which = np.unique(spans.reshape(-1, 4), axis=0, return_inverse=True)

@@ -24,26 +24,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import ArrayLike, NDArray
 
+from toolkit.capture import names
 from toolkit.capture.cameras import parse_camera
 from toolkit.capture.devices import session_id, session_of
-from toolkit.capture.names import (
-    HOW_TO_ALLOW,
-    bad_names,
-    is_linked_here,
-    leads_out,
-    links_out,
-    outside_allowed,
-    require_name,
-    roots_of,
-)
-from toolkit.capture.rigs import find_rigs
 from toolkit.capture.tables import (
     ALIGNED,
     COLUMNS,
     POSE_NAMES,
     SIGNALS,
-    Floats,
-    Ints,
     KeyIndex,
     TextTable,
     as_pandas,
@@ -56,7 +44,7 @@ from toolkit.capture.tables import (
 from toolkit.capture.trajectory import Trajectory
 from toolkit.errors import CaptureError
 from toolkit.files import files_fingerprint, own_name
-from toolkit.geometry import pose_from_qt
+from toolkit.geometry import Floats, Ints, pose_from_qt
 
 if TYPE_CHECKING:
     import pycolmap
@@ -99,8 +87,8 @@ class Session:
         self._strict = strict
         if not self.path.is_dir():
             raise CaptureError(f"No such session folder: {self.path}.")
-        require_name(self.path.name, "session", self.path.parent)
-        self._links_allowed = outside_allowed() or is_linked_here(self.path)
+        names.require_name(self.path.name, "session", self.path.parent)
+        self._links_allowed = names.outside_allowed() or names.is_linked_here(self.path)
         self._sensor_table = self._read("sensors.txt", extra=True)
         self.sensors = self._sensor_table.frame("sensor_id", "name", "sensor_type")
         self.sensors["params"] = as_pandas(self._sensor_table.columns["extra"])
@@ -141,32 +129,17 @@ class Session:
 
     def _read(self, file: str, extra: bool = False) -> TextTable:
         path = self.path / file
-        if not self._links_allowed and (target := leads_out(path, self._roots)):
-            raise CaptureError(
-                f"{path}: is a link to {target}, outside of the capture. Copy the file, or, if the link is yours: "
-                f"{HOW_TO_ALLOW}."
-            )
+        if not self._links_allowed and (target := names.leads_out(path, self._roots)):
+            raise CaptureError(f"{path}: {_linked_out(target)}")
         table = read_table(path, COLUMNS.get(file, COLUMNS["keyframes"]), self._strict, extra)
         if not self._strict:
             self.tables[file] = table
             return table
-        if file in ("trajectories.txt", ALIGNED):
-            table.repeated(key_of(file))  # keeps repeated poses, because covariances are read later by row
-            return table
         if file in ("sensors.txt", *SIGNALS):  # sensors: see `_sensor_rows`; signals may repeat
             return table
-        return table.without_repeated(key_of(file))
-
-    def _require_different(self, images: TextTable) -> None:
-        """Refuse two images with one path, because outputs identify an image by its path."""
-        if not self._strict:
-            return
-        for row in np.flatnonzero(images.frame("image_path").duplicated())[:1].tolist():
-            path = images.columns["image_path"][row].as_py()
-            raise CaptureError(
-                f"{images.where(row)}: found the image {path!r} again, with another timestamp or sensor. Remove one "
-                "of the two lines, or use two files."
-            )
+        again = table.repeated(key_of(file))
+        is_trajectory = file in ("trajectories.txt", ALIGNED)  # keeps its rows: covariances are read later by row
+        return table if is_trajectory or not len(again) else table.without(again)
 
     def _trajectory(self, file: str) -> Trajectory | None:
         return Trajectory.from_table(self._read(file)) if (self.path / file).exists() else None
@@ -199,7 +172,7 @@ class Session:
 
     @cached_property
     def _roots(self) -> list[Path]:
-        return roots_of(self.path)
+        return names.roots_of(self.path)
 
     # Files
 
@@ -246,23 +219,24 @@ class Session:
     @cached_property
     def _raw_data(self) -> Path:
         """The folder of the images. Checks their paths first, which sessions without image access need not wait for."""
-        self._require_different(self._image_table)
+        again = np.flatnonzero(self.images["path"].duplicated())
+        if len(again) and self._strict:  # outputs identify an image by its path
+            found = f"the image {self.images['path'][again[0]]!r} again, with another timestamp or sensor"
+            raise CaptureError(f"{self._image_table.where(again[0])}: found {found}. Remove a line, or use two files.")
         self._require_no_link_out(self._image_table, "image_path")
         return self.path / RAW_DATA
 
     def _require_no_link_out(self, table: TextTable, column: str) -> None:
         for row, target in self.links_out(table.frame(column)[column]).items() if self._strict else ():
-            raise CaptureError(
-                f"{table.where(row)}: {RAW_DATA}/{table.columns[column][row].as_py()} is a link to {target}, outside "
-                f"of the capture. Copy the file, or, if the link is yours: {HOW_TO_ALLOW}."
-            )
+            path = f"{RAW_DATA}/{table.columns[column][row].as_py()}"
+            raise CaptureError(f"{table.where(row)}: {path} {_linked_out(target)}")
 
     def links_out(self, paths: "pd.Series[str]") -> dict[int, Path]:
         """Return the paths below raw_data/ that links lead outside of the capture: their rows in `paths` and targets.
 
         Empty if links are allowed, or if `import` made the links of this session on this machine.
         """
-        return {} if self._links_allowed else links_out(self.path / RAW_DATA, paths, self._roots)
+        return {} if self._links_allowed else names.links_out(self.path / RAW_DATA, paths, self._roots)
 
     @cached_property
     def camera_rows(self) -> Ints:
@@ -291,17 +265,14 @@ class Session:
     def _sensor_rows(self) -> dict[str, int]:
         rows = {sensor: row for row, sensor in enumerate(self._sensor_table.columns["sensor_id"].to_pylist())}
         if len(rows) < len(self._sensor_table) and self._strict:
-            self._sensor_table.without_repeated(key_of("sensors.txt"))  # logs the repeated line, or raises
+            self._sensor_table.repeated(key_of("sensors.txt"))  # logs the repeated line, or raises
         return rows
 
     def _sensor_row(self, sensor_id: str) -> int:
         row = self._sensor_rows.get(sensor_id)
         if row is None:
-            raise CaptureError(
-                f"Unknown sensor {sensor_id!r} in session {self.id}: it is none of the {len(self.sensors)} sensors in "
-                f"{self._sensor_table.path}, e.g. {list(self._sensor_rows)[:3]}. Add it there, or correct the id where "
-                "it is used."
-            )
+            known = f"the {len(self.sensors)} sensors in {self._sensor_table.path}, e.g. {list(self._sensor_rows)[:3]}"
+            raise CaptureError(f"Unknown sensor {sensor_id!r} in session {self.id}: it is none of {known}. Add it.")
         return row
 
     def has_sensor(self, sensor_id: str) -> bool:
@@ -338,7 +309,7 @@ class Session:
 
     def _checked(self, subsessions: Sequence[str], file: str) -> list[str]:
         for name in subsessions if self._strict else ():
-            require_name(name, "subsession", self.path / file)
+            names.require_name(name, "subsession", self.path / file)
         return list(subsessions)
 
     def subsession_of(self, rows: Rows = None) -> Strings:
@@ -350,7 +321,7 @@ class Session:
         columns = [as_strings(self.images[name]) for name in ("sensor_id", "path")]
         if not (self.path / SUBSESSIONS).exists():
             parts = pc.split_pattern(columns[1], "/", max_splits=1)
-            in_folder = pc.and_(pc.greater(pc.list_value_length(parts), 1), pc.invert(bad_names(columns[1])))
+            in_folder = pc.and_(pc.greater(pc.list_value_length(parts), 1), pc.invert(names.bad_names(columns[1])))
             first = pc.if_else(in_folder, pc.list_element(parts, 0), self.id)  # the id if in no folder
             self._checked(pc.unique(first).to_pylist(), "images.txt")
             return first.to_numpy(zero_copy_only=False)
@@ -366,8 +337,8 @@ class Session:
 
         The name is `<name>` for `proc/keyframes_<name>.txt`, and `queries` for LaMAR's `queries.txt`.
         """
-        names = sorted(path.name for path in (self.path / "proc").glob("keyframes_*.txt"))
-        files = {name.removesuffix(".txt").removeprefix("keyframes_"): f"proc/{name}" for name in names}
+        paths = sorted((self.path / "proc").glob("keyframes_*.txt"))
+        files = {path.stem.removeprefix("keyframes_"): f"proc/{path.name}" for path in paths}
         return files | ({"queries": "queries.txt"} if (self.path / "queries.txt").exists() else {})
 
     def keyframes(self, name: str = "keyframes_pruned_subsampled") -> pd.DataFrame:
@@ -388,10 +359,8 @@ class Session:
             return keys.drop_duplicates(ignore_index=True)
         short, files = name.removesuffix(".txt").removeprefix("keyframes_"), self.keyframe_files
         if short not in files:
-            raise CaptureError(
-                f"Session {self.id} has no keyframe list {name!r}; available: "
-                f"{', '.join([*files, 'all'])} (from {self.path / 'proc'}/keyframes_*.txt)."
-            )
+            available = f"{', '.join([*files, 'all'])} (from {self.path / 'proc'}/keyframes_*.txt)"
+            raise CaptureError(f"Session {self.id} has no keyframe list {name!r}; available: {available}.")
         if short not in self._keyframes:
             self._keyframes[short] = self._read(files[short]).frame("timestamp", "device_id")
         return self._keyframes[short].copy()
@@ -409,7 +378,7 @@ class Session:
         return self._find_devices(times_of(self.images), as_strings(self.images["sensor_id"]))
 
     def _find_devices(self, timestamps: Ints, sensors: pa.Array) -> tuple[pa.Array, Ints]:
-        rig_rows = find_rigs(self.rigs, timestamps, sensors, self._posed_keys())
+        rig_rows = _find_rigs(self.rigs, timestamps, sensors, self._posed_keys())
         in_rig = rig_rows >= 0
         if self.rigs is None or not in_rig.any():
             return sensors, rig_rows
@@ -432,10 +401,9 @@ class Session:
 
     def _posed_keys(self) -> Iterator[tuple[Ints, pa.Array]]:
         """Yield timestamps and device ids of poses, then of keyframes: they tell which rigs exist at which time."""
-        if self.trajectory is not None:
-            yield self.trajectory.timestamps, self.trajectory.arrow_ids
-        if self.ground_truth is not None and self.ground_truth is not self.trajectory:
-            yield self.ground_truth.timestamps, self.ground_truth.arrow_ids
+        for trajectory in dict.fromkeys((self.trajectory, self.ground_truth)):
+            if trajectory is not None:
+                yield trajectory.timestamps, trajectory.arrow_ids
         for name in self.keyframe_files:
             keys = self.keyframes(name)
             yield times_of(keys), as_strings(keys["device_id"])
@@ -491,16 +459,20 @@ class Session:
 
     @cached_property
     def _image_index(self) -> tuple[KeyIndex, Ints]:
-        """An index of photographs by (timestamp, device_id), and the row of each photograph in `images`."""
+        """An index of the images of cameras by (timestamp, device_id), and the row of each in `images`."""
         non_cameras = self.sensors["sensor_id"][self.sensors["sensor_type"] != "camera"]
-        photographs = np.flatnonzero(~self.images["sensor_id"].isin(non_cameras))
-        devices = self._devices[0].take(pa.array(photographs))
-        return KeyIndex(times_of(self.images)[photographs], devices), photographs
+        images = np.flatnonzero(~self.images["sensor_id"].isin(non_cameras))
+        return KeyIndex(times_of(self.images)[images], self._devices[0].take(pa.array(images))), images
 
     def rows_of_keyframes(self, keyframes: pd.DataFrame) -> list[Ints]:
-        """Return, for each row of a keyframe table, the rows in `images` of its photographs, in file order."""
-        index, photographs = self._image_index
-        return [photographs[rows] for rows in index.find_all(times_of(keyframes), keyframes["device_id"])]
+        """Return, for each row of a keyframe table, the rows in `images` of its camera images, in file order."""
+        index, images = self._image_index
+        return [images[rows] for rows in index.find_all(times_of(keyframes), keyframes["device_id"])]
+
+
+def _linked_out(target: Path) -> str:
+    how = f"Copy the file, or, if the link is yours: {names.HOW_TO_ALLOW}."
+    return f"is a link to {target}, outside of the capture. {how}"
 
 
 def _records(table: TextTable, column: str) -> pd.DataFrame:
@@ -513,3 +485,55 @@ def _selection(rows: Rows) -> Any:
         return slice(None) if rows is None else rows
     rows = np.atleast_1d(np.asarray(rows))
     return rows if rows.dtype == bool else rows.astype(np.int64)
+
+
+def _find_rigs(
+    rigs: pd.DataFrame | None, timestamps: Ints, sensors: pa.Array, posed: Iterable[tuple[Ints, pa.Array]]
+) -> Ints:
+    """Return the row of rigs.txt for each (timestamp, sensor), (n,), -1 where no rig holds the sensor.
+
+    A sensor can be in any number of rigs, because rig ids often differ from frame to frame. The rig is the one with a
+    pose or a keyframe at that time; without any, the sensor's only rig; as a last resort, the rig named after the
+    timestamp.
+
+    Args:
+        rigs: table [rig_id, sensor_id].
+        timestamps, sensors: n keys.
+        posed: timestamps and device ids of poses and keyframes, one pair per file; the first file with an entry wins.
+    """
+    rig_rows = np.full(len(timestamps), -1, np.int64)
+    if rigs is None or rigs.empty:
+        return rig_rows
+    rig_ids, members = as_strings(rigs["rig_id"]), as_strings(rigs["sensor_id"])
+    different_rigs = pc.unique(rig_ids)
+    rows_of_rig = pd.DataFrame({"rig": codes_of(rig_ids, different_rigs), "row": np.arange(len(rigs))})
+    unknown = np.ones(len(timestamps), bool)  # keys without a rig or a pose of the sensor itself so far
+    for times, devices in posed:
+        keys = np.flatnonzero(unknown)
+        if not len(keys):
+            return rig_rows
+        rig_codes = codes_of(devices, different_rigs)
+        if np.any(rig_codes < 0):  # a pose of the sensor itself takes precedence over that of its rig
+            direct = KeyIndex(times, devices).find(timestamps[keys], sensors.take(pa.array(keys))) >= 0
+            unknown[keys[direct]] = False
+            keys = keys[~direct]
+        held = pd.DataFrame({"time": times, "rig": rig_codes}).merge(rows_of_rig, on="rig")
+        rows = held["row"].to_numpy(np.int64)
+        index = KeyIndex(held["time"].to_numpy(np.int64), members.take(pa.array(rows)))
+        matches = index.find(timestamps[keys], sensors.take(pa.array(keys)))
+        keys, matches = keys[matches >= 0], matches[matches >= 0]
+        rig_rows[keys], unknown[keys] = rows[matches], False
+
+    keys = np.flatnonzero(unknown)
+    if len(keys):
+        only_rigs = np.flatnonzero(~rigs["sensor_id"].duplicated(keep=False))
+        matches = codes_of(sensors.take(pa.array(keys)), members.take(pa.array(only_rigs)))
+        rig_rows[keys] = np.append(only_rigs, -1)[matches]
+        keys = keys[matches < 0]
+    if len(keys):
+        digits = pc.struct_field(pc.extract_regex(rig_ids, r"(?P<digits>[0-9]{1,18})[^/]*$"), "digits")
+        rows = np.flatnonzero(pc.is_valid(digits).to_numpy(zero_copy_only=False))
+        times = digits.take(pa.array(rows)).cast(pa.int64()).to_numpy()
+        matches = KeyIndex(times, members.take(pa.array(rows))).find(timestamps[keys], sensors.take(pa.array(keys)))
+        rig_rows[keys] = np.append(rows, -1)[matches]
+    return rig_rows

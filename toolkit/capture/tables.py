@@ -8,7 +8,7 @@ convert the columns. Only malformed values are looked at one by one, and error m
 
 import errno
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,8 +31,7 @@ Columns = Sequence[tuple[str, str]]
 # Column types. METERS is a bounded coordinate, ID a valid name, PATH the path of an image, TEXT any text.
 INTEGER, NUMBER, METERS, LATITUDE, LONGITUDE = "integer", "finite number", "meters", "latitude", "longitude"
 ID, PATH, TEXT = "id", "path", "text"
-FARTHEST_M = 1e12
-"""Largest coordinate, meters: beyond any place, and small enough that its square is finite."""
+FARTHEST_M = 1e12  # largest coordinate, meters: beyond any place, and small enough that its square is finite
 POSE_NAMES = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 POSE = tuple((name, NUMBER if name.startswith("q") else METERS) for name in POSE_NAMES)
 ALIGNED = "proc/alignment_trajectories.txt"
@@ -56,8 +55,7 @@ COLUMNS: dict[str, Columns] = {
 }
 """Names and types of the columns of each file of a session. Further columns of wifi.txt and bt.txt (name, times of the
 scan) are not used."""
-SIGNALS = ("wifi.txt", "bt.txt")
-"""Files whose keys may repeat, because a scan may receive an emitter several times."""
+SIGNALS = ("wifi.txt", "bt.txt")  # files whose keys may repeat, because a scan may receive an emitter several times
 
 
 def key_of(file: str) -> list[str]:
@@ -71,14 +69,11 @@ class TextTable:
     """The well-formed rows of a text file, and the problems of its other lines."""
 
     path: Path
-    columns: dict[str, pa.Array]
-    """Values by column name; `extra`, if requested, holds the text after the last column."""
-    lines: Ints
-    """Line number of each row, from 1."""
+    columns: dict[str, pa.Array]  # values by column name; `extra`, if requested, holds the text after the last column
+    lines: Ints  # line number of each row, from 1
     problems: list[tuple[int, str]]
     """Line number (0 for the whole file) and fault of each malformed line; these lines are not in `columns`."""
-    has_extra: bool
-    """Whether any line has more columns than expected."""
+    has_extra: bool  # whether any line has more columns than expected
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -96,42 +91,32 @@ class TextTable:
         return f"{self.path}, line {self.lines[row]}"
 
     def repeated(self, key: list[str]) -> Ints:
-        """Return the rows that repeat the key of an earlier row, ascending.
+        """Return the rows that repeat the key of an earlier row, ascending, and log the first.
 
         Raises:
             CaptureError: a repeated row differs from the earlier one.
         """
         if key[0] == "timestamp" and np.all(np.diff(self.columns["timestamp"].to_numpy()) > 0):
             return np.zeros(0, np.int64)  # the usual case: distinct timestamps make distinct keys
-        again = np.flatnonzero(self.frame(*key).duplicated())
-        if len(again):
-            different = again[~self.frame(*self.columns).duplicated().to_numpy()[again]]
-            for row in different[:1].tolist():
-                raise CaptureError(
-                    f"{self.where(row)}: {self._shown(row, key)} again, with other values than in line "
-                    f"{self._first_line(row, key)}. Remove one of the two."
-                )
+        keys = self.frame(*key)
+        again = np.flatnonzero(keys.duplicated())
+        if not len(again):
+            return again
+        different = again[~self.frame(*self.columns).duplicated().to_numpy()[again]]
+        row = int([*different, again[0]][0])
+        first = self.lines[np.flatnonzero((keys == keys.iloc[row]).all(axis=1))[0]]
+        shown = f"{self.where(row)}: {', '.join(f'{name} {self.columns[name][row].as_py()!r}' for name in key)} again"
+        if len(different):
+            raise CaptureError(f"{shown}, with other values than in line {first}. Remove one of the two.")
+        more = f", and {len(again) - 1} more such lines" if len(again) > 1 else ""
+        log.warning("%s, as in line %d%s; each counts once.", shown, first, more)
         return again
 
-    def without_repeated(self, key: list[str]) -> "TextTable":
-        """Return the table without repeated lines, and log them; raises as `repeated` does."""
-        again = self.repeated(key)
-        if not len(again):
-            return self
-        more = f", and {len(again) - 1} more such lines" if len(again) > 1 else ""
-        first = int(again[0])
-        log.warning("%s: %s again, as in line %d%s; each counts once.", self.where(first), self._shown(first, key),
-                    self._first_line(first, key), more)  # fmt: skip
-        kept = np.delete(np.arange(len(self)), again)
+    def without(self, rows: Ints) -> "TextTable":
+        """Return the table without some rows."""
+        kept = np.delete(np.arange(len(self)), rows)
         columns = {name: column.take(pa.array(kept)) for name, column in self.columns.items()}
         return replace(self, columns=columns, lines=self.lines[kept])
-
-    def _shown(self, row: int, names: list[str]) -> str:
-        return ", ".join(f"{name} {self.columns[name][row].as_py()!r}" for name in names)
-
-    def _first_line(self, row: int, key: list[str]) -> int:
-        frame = self.frame(*key)
-        return int(self.lines[np.flatnonzero((frame == frame.iloc[row]).all(axis=1))[0]])
 
 
 def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = False) -> TextTable:
@@ -151,31 +136,32 @@ def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = 
             raise OSError(errno.EINVAL, "not a file")
         table = _parse(path, path.read_bytes(), columns, extra)
     except FileNotFoundError:
-        message = f"file not found; expected lines of `{_layout(columns)}`"
-        if strict:
-            raise CaptureError(f"{path}: {message}. Is the session complete?") from None
-        empty = {name: pa.array([], _ARROW_TYPES[kind]) for name, kind in [*columns, ("extra", TEXT)]}
-        return TextTable(path, empty, np.zeros(0, np.int64), [(0, message)], False)
+        table = replace(
+            _parse(path, b"", columns, extra), problems=[(0, f"file not found; expected {_layout(columns)}")]
+        )
     except OSError as error:
         raise CaptureError(f"File cannot be read: {path} ({error.strerror}). Expected a text file.") from None
-    problems = table.problems
-    if strict and problems:
-        line, fault = problems[0]
-        more = f" ({len(problems) - 1} more such lines.)" if len(problems) > 1 else ""
-        raise CaptureError(
-            f"{path}, line {line}: {fault}. Correct or remove the line; "
-            f"`python -m toolkit check CAPTURE` lists all problems.{more}"
-        )
-    return table
+    if not strict or not table.problems:
+        return table
+    line, fault = table.problems[0]
+    if not line:
+        raise CaptureError(f"{path}: {fault}. Is the session complete?")
+    more = f" ({len(table.problems) - 1} more such lines.)" if len(table.problems) > 1 else ""
+    advice = f"Correct or remove the line; `python -m toolkit check CAPTURE` lists all problems.{more}"
+    raise CaptureError(f"{path}, line {line}: {fault}. {advice}")
 
 
-_MOST = {METERS: FARTHEST_M, LATITUDE: 90.0, LONGITUDE: 180.0}
-"""Largest absolute value of each bounded column type."""
-_ARROW_TYPES = {
-    INTEGER: pa.int64(),
-    **dict.fromkeys((NUMBER, *_MOST), pa.float64()),
-    **dict.fromkeys((ID, PATH, TEXT), pa.large_string()),
+_TYPES: dict[str, tuple[pa.DataType, float | None, str]] = {
+    INTEGER: (pa.int64(), None, "an integer (microseconds)"),
+    NUMBER: (pa.float64(), np.inf, "a finite number"),
+    METERS: (pa.float64(), FARTHEST_M, f"a finite number of meters, at most {FARTHEST_M:.0e}"),
+    LATITUDE: (pa.float64(), 90.0, "degrees from -90 to 90"),
+    LONGITUDE: (pa.float64(), 180.0, "degrees from -180 to 180"),
+    ID: (pa.large_string(), None, EXPECTED_NAME),
+    PATH: (pa.large_string(), None, f"{EXPECTED_NAME}, below raw_data/ (for your own files elsewhere, {HOW_TO_ALLOW})"),
+    TEXT: (pa.large_string(), None, "any text"),
 }
+"""Type in memory, largest absolute value, and what is expected, for messages, of each type of column."""
 
 
 def _layout(columns: Columns) -> str:
@@ -199,77 +185,65 @@ def _parse(path: Path, data: bytes, columns: Columns, keep_extra: bool) -> TextT
     width = len(columns)
     values = pc.split_pattern(text, ",", max_splits=width)
     counts = pc.list_value_length(values).to_numpy()
-    if np.any(counts < width):
-        for row in np.flatnonzero(counts < width):
-            found = f"{counts[row]} value{'s' if counts[row] > 1 else ''} in {_shorten(text[row])}"
-            problems.append((int(lines[row]), f"found {found}, expected {width}: {_layout(columns)}"))
-        good = counts >= width
-        values, lines, counts = values.filter(pa.array(good)), lines[good], counts[good]
-
-    arrays: dict[str, pa.Array] = {}
     bad = np.zeros(len(lines), bool)
+
+    def refuse(wrong: NDArray[np.bool_], fault: Callable[[int], str]) -> None:
+        problems.extend((int(lines[row]), fault(row)) for row in np.flatnonzero(wrong & ~bad).tolist())
+        bad[wrong] = True
+
+    def too_few(row: int) -> str:
+        line = text[row].as_py()
+        shown = repr(line if len(line) <= 60 else line[:57] + "...")
+        return (
+            f"found {counts[row]} value{'s' * bool(counts[row] > 1)} in {shown}, expected {width}: {_layout(columns)}"
+        )
+
+    refuse(counts < width, too_few)
+    if bad.any():
+        values, lines, counts, bad = values.filter(pa.array(~bad)), lines[~bad], counts[~bad], bad[~bad]
+    arrays: dict[str, pa.Array] = {}
     for index, (name, kind) in enumerate(columns):
         column = pc.ascii_trim_whitespace(pc.list_element(values, index))
         arrays[name], wrong = convert(column, kind)
-        for row in np.flatnonzero(wrong & ~bad):
-            problems.append((int(lines[row]), f"found {name} = {column[row].as_py()!r}, expected {_EXPECTED[kind]}"))
-        bad |= wrong
+        refuse(wrong, lambda row: f"found {name} = {column[row].as_py()!r}, expected {_TYPES[kind][2]}")  # noqa: B023
     has_extra = bool(np.any(counts > width))
     if keep_extra:
         # The extra text is the last value of its line, after the `width` expected ones.
-        last = np.cumsum(counts) - 1
-        extra = pc.ascii_trim_whitespace(values.flatten().take(pa.array(last)))
+        extra = pc.ascii_trim_whitespace(values.flatten().take(pa.array(np.cumsum(counts) - 1)))
         arrays["extra"] = pc.if_else(pa.array(counts > width), extra, "")
     if columns[-len(POSE) :] == POSE:
         q = np.stack([arrays[name].to_numpy() for name, _ in POSE[:4]], axis=1)
         with np.errstate(over="ignore"):
             squared = np.einsum("ij,ij->i", q, q)
-        faults = {"a zero quaternion": squared < 1e-12, "a quaternion of huge length": squared > FARTHEST_M**2}
-        for fault, wrong in faults.items():
-            rows = np.flatnonzero(wrong & ~bad)
-            problems += [(int(lines[row]), f"found {fault}, expected length 1") for row in rows]
-            bad |= wrong
+        refuse(squared < 1e-12, lambda _: "found a zero quaternion, expected length 1")
+        refuse(squared > FARTHEST_M**2, lambda _: "found a quaternion of huge length, expected length 1")
     if bad.any():
-        good_rows = pa.array(~bad)
-        arrays, lines = {name: array.filter(good_rows) for name, array in arrays.items()}, lines[~bad]
+        arrays, lines = {name: array.filter(pa.array(~bad)) for name, array in arrays.items()}, lines[~bad]
     return TextTable(path, arrays, lines, sorted(problems), has_extra)
-
-
-_EXPECTED = {
-    INTEGER: "an integer (microseconds)",
-    NUMBER: "a finite number",
-    METERS: f"a finite number of meters, at most {FARTHEST_M:.0e}",
-    LATITUDE: "degrees from -90 to 90",
-    LONGITUDE: "degrees from -180 to 180",
-    ID: EXPECTED_NAME,
-    PATH: f"{EXPECTED_NAME}, below raw_data/ (for your own files elsewhere, {HOW_TO_ALLOW})",
-}
 
 
 def convert(column: pa.Array, kind: str) -> tuple[pa.Array, NDArray[np.bool_]]:
     """Return a column converted to its type, and which of its values are wrong; such numbers may become 0."""
-    if kind == TEXT:
-        return column, np.zeros(len(column), bool)
     if kind in (ID, PATH):
         return column, bad_names(column, kind == PATH and outside_allowed()).to_numpy(zero_copy_only=False)
+    target, most, _ = _TYPES[kind]
     wrong = np.zeros(len(column), bool)
     try:
-        converted = column.cast(_ARROW_TYPES[kind])
+        converted = column.cast(target)
     except pa.ArrowInvalid:  # find the malformed values among those that are not plain numbers
-        plain = pc.match_substring_regex(column, r"^-?\d{1,18}$" if kind == INTEGER else r"^-?\d{1,18}(\.\d{1,18})?$")
+        plain = pc.match_substring_regex(column, r"^-?\d{1,18}$" if most is None else r"^-?\d{1,18}(\.\d{1,18})?$")
         for row in np.flatnonzero(~plain.to_numpy(zero_copy_only=False)):
             try:
-                column[row].cast(_ARROW_TYPES[kind])
+                column[row].cast(target)
             except pa.ArrowInvalid:
                 wrong[row] = True
-        converted = pc.if_else(pa.array(wrong), "0", column).cast(_ARROW_TYPES[kind])
+        converted = pc.if_else(pa.array(wrong), "0", column).cast(target)
     if kind == INTEGER:  # Arrow reads 0x10 as 16
-        for prefix in ("0x", "0X"):
-            wrong |= pc.starts_with(column, prefix).to_numpy(zero_copy_only=False)
-    elif kind in _MOST:
-        wrong |= ~(np.abs(converted.to_numpy()) <= _MOST[kind])
-    else:
-        wrong |= ~np.isfinite(converted.to_numpy())
+        wrong |= pc.match_substring(column, "x").to_numpy(zero_copy_only=False)
+        wrong |= pc.match_substring(column, "X").to_numpy(zero_copy_only=False)
+    elif most is not None:
+        values = np.abs(converted.to_numpy())
+        wrong |= ~((values <= most) & (values < np.inf))
     return converted, wrong
 
 
@@ -282,11 +256,6 @@ def _fault(text: bytes) -> str:
     if b"\r" in text.removesuffix(b"\r"):
         return "found a carriage return within the line, expected each line to end in a line feed"
     return ""
-
-
-def _shorten(text: object) -> str:
-    shown = str(text)
-    return repr(shown if len(shown) <= 60 else shown[:57] + "...")
 
 
 def as_pandas(column: pa.Array) -> Any:
@@ -303,13 +272,11 @@ def times_of(table: pd.DataFrame) -> Ints:
 
 def as_strings(ids: Any) -> pa.Array:
     """Return ids (a sequence, array or Series of str) as one Arrow array."""
-    if isinstance(ids, (pd.Series, pd.api.extensions.ExtensionArray)):
-        ids = pa.array(ids)
-    elif not isinstance(ids, (pa.Array, pa.ChunkedArray)):
-        ids = pa.array(np.asarray(ids, object).ravel(), pa.large_string())
-    if isinstance(ids, pa.ChunkedArray):
-        ids = ids.combine_chunks()
-    return ids if ids.type == pa.large_string() else ids.cast(pa.large_string())
+    if not isinstance(ids, pa.Array | pa.ChunkedArray):
+        is_pandas = isinstance(ids, pd.Series | pd.api.extensions.ExtensionArray)
+        ids = pa.array(ids) if is_pandas else pa.array(np.asarray(ids, object).ravel(), pa.large_string())
+    ids = ids.combine_chunks() if isinstance(ids, pa.ChunkedArray) else ids
+    return ids.cast(pa.large_string())
 
 
 def codes_of(ids: pa.Array, vocabulary: pa.Array) -> Ints:
@@ -323,27 +290,21 @@ class KeyIndex:
 
     def __init__(self, timestamps: Ints, ids: Any) -> None:
         ids = as_strings(ids)
-        self._times = np.unique(timestamps)
-        self._ids = pc.unique(ids)
+        self._times, self._ids = pd.Index(np.unique(timestamps)), pc.unique(ids)
         keys = self._keys(timestamps, ids)
         self._order = np.argsort(keys, kind="stable")
         self._sorted = keys[self._order]
 
     def _keys(self, timestamps: Ints, ids: Any) -> Ints:
-        times = np.searchsorted(self._times, timestamps)
-        codes = codes_of(as_strings(ids), self._ids)
-        known = (codes >= 0) & (times < len(self._times))
-        if len(self._times):
-            known &= self._times[np.minimum(times, len(self._times) - 1)] == timestamps
-        return np.where(known, times * len(self._ids) + codes, -1)
+        times, codes = self._times.get_indexer(timestamps), codes_of(as_strings(ids), self._ids)
+        return np.where((times >= 0) & (codes >= 0), times * len(self._ids) + codes, -1)
 
     def find(self, timestamps: Ints, ids: Any) -> Ints:
         """Return the first row with each key, (n,) int64, -1 without any."""
         keys = self._keys(timestamps, ids)
-        if not len(self._sorted):
-            return np.full(len(keys), -1, np.int64)
-        nearest = np.minimum(np.searchsorted(self._sorted, keys), len(self._sorted) - 1)
-        return np.where((self._sorted[nearest] == keys) & (keys >= 0), self._order[nearest], -1)
+        first = np.searchsorted(self._sorted, keys)
+        found = (np.append(self._sorted, -1)[first] == keys) & (keys >= 0)
+        return np.where(found, np.append(self._order, -1)[first], -1)
 
     def find_all(self, timestamps: Ints, ids: Any) -> list[Ints]:
         """Return all rows with each key, in the table's order."""
@@ -384,6 +345,7 @@ def read_query_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
 
 
 def write_table(path: Path, header: str | None, rows: Iterable[str]) -> None:
+    """Write lines to a file atomically, after a comment."""
     with write_atomic(path) as temporary, open(temporary, "w", encoding="utf-8", newline="\n") as stream:
         if header is not None:
             stream.write(f"# {header}\n")

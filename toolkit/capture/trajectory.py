@@ -10,19 +10,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import ArrayLike, NDArray
 
-from toolkit.capture.tables import (
-    COLUMNS,
-    NUMBER,
-    POSE_NAMES,
-    Floats,
-    KeyIndex,
-    TextTable,
-    as_strings,
-    convert,
-    read_table,
-    write_table,
-)
-from toolkit.geometry import pose_from_qt, qt_from_pose
+from toolkit.capture import tables
+from toolkit.geometry import Floats, pose_from_qt, qt_from_pose
 
 log = logging.getLogger(__name__)
 
@@ -46,13 +35,11 @@ class Trajectory:
     ) -> None:
         """Make a trajectory. Covariances are given, (N, 6, 6), or read from the file `source` at first use."""
         self.timestamps = np.asarray(timestamps, np.int64)
-        self.arrow_ids = as_strings(device_ids)
+        self.arrow_ids = tables.as_strings(device_ids)
         self.qt = np.asarray(qt, np.float64).reshape(-1, 7)
         if not len(self.timestamps) == len(self.arrow_ids) == len(self.qt):
-            raise ValueError(
-                f"Expected equally many timestamps, device ids and poses, got {len(self.timestamps)}, "
-                f"{len(self.arrow_ids)} and {len(self.qt)}."
-            )
+            found = f"{len(self.timestamps)}, {len(self.arrow_ids)} and {len(self.qt)}"
+            raise ValueError(f"Expected equally many timestamps, device ids and poses, got {found}.")
         self._covariances = None if covariances is None else np.asarray(covariances, np.float64).reshape(-1, 6, 6)
         self._source = source
 
@@ -70,17 +57,14 @@ class Trajectory:
         Raises:
             CaptureError: the file is missing or has a malformed line.
         """
-        return cls.from_table(read_table(Path(path), COLUMNS["trajectories.txt"]))
+        return cls.from_table(tables.read_table(Path(path), tables.COLUMNS["trajectories.txt"]))
 
     @classmethod
-    def from_table(cls, table: TextTable) -> "Trajectory":
+    def from_table(cls, table: tables.TextTable) -> "Trajectory":
         """Make a trajectory from the table of a trajectories file."""
-        return cls(
-            table.columns["timestamp"].to_numpy(),
-            table.columns["device_id"],
-            table.numbers(POSE_NAMES),
-            source=table.path if table.has_extra and not table.problems else None,
-        )
+        source = table.path if table.has_extra and not table.problems else None
+        times, devices = table.columns["timestamp"].to_numpy(), table.columns["device_id"]
+        return cls(times, devices, table.numbers(tables.POSE_NAMES), source=source)
 
     def write(self, path: str | Path) -> None:
         """Write the file atomically, with numbers that read back exactly. NaN covariances are omitted."""
@@ -90,11 +74,8 @@ class Trajectory:
             flat = covariances.reshape(-1, 36).tolist()
             values = [[*pose, *more] if has else pose for pose, more, has in zip(values, flat, finite, strict=True)]
         rows = zip(self.timestamps.tolist(), self.arrow_ids.to_pylist(), values, strict=True)
-        write_table(
-            Path(path),
-            "timestamp, device_id, qw, qx, qy, qz, tx, ty, tz, *covar",
-            (f"{time}, {device}, {', '.join(map(repr, numbers))}" for time, device, numbers in rows),
-        )
+        lines = (f"{time}, {device}, {', '.join(map(repr, numbers))}" for time, device, numbers in rows)
+        tables.write_table(Path(path), "timestamp, device_id, qw, qx, qy, qz, tx, ty, tz, *covar", lines)
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -111,24 +92,21 @@ class Trajectory:
         A covariance with a value that is not a finite number counts as none, with a warning.
         """
         if self._covariances is None and self._source is not None:
-            table = read_table(self._source, COLUMNS["trajectories.txt"], extra=True)
-            extra = table.columns["extra"]
+            table = tables.read_table(self._source, tables.COLUMNS["trajectories.txt"], extra=True)
+            extra, self._source = table.columns["extra"], None
             rows = np.flatnonzero(pc.equal(pc.count_substring(extra, ","), 35).to_numpy(zero_copy_only=False))
-            if len(rows):
-                self._covariances = np.full((len(self), 6, 6), np.nan)
-                malformed = list[int]()
-                for start in range(0, len(rows), 4096):
-                    block = rows[start : start + 4096]
-                    values = pc.split_pattern(extra.take(pa.array(block)), ",").flatten()
-                    numbers, wrong = convert(pc.ascii_trim_whitespace(values), NUMBER)
-                    self._covariances[block] = numbers.to_numpy().reshape(-1, 6, 6)
-                    malformed += block[wrong.reshape(-1, 36).any(axis=1)].tolist()
-                if malformed:
-                    self._covariances[malformed] = np.nan
-                    more = f", and in {len(malformed) - 1} more lines" if len(malformed) > 1 else ""
-                    log.warning("%s: the covariance has values that are not finite numbers%s; such a covariance is not "
-                                "used.", table.where(malformed[0]), more)  # fmt: skip
-            self._source = None
+            covariances = np.full((len(self), 6, 6), np.nan)
+            for block in np.split(rows, range(4096, len(rows), 4096)):  # bounds the memory
+                values = pc.split_pattern(extra.take(pa.array(block)), ",").flatten()
+                numbers, wrong = tables.convert(pc.ascii_trim_whitespace(values), tables.NUMBER)
+                finite = ~wrong.reshape(-1, 36).any(axis=1)
+                covariances[block[finite]] = numbers.to_numpy().reshape(-1, 6, 6)[finite]
+            malformed = rows[np.isnan(covariances[rows, 0, 0])]
+            if len(malformed):
+                more = f", and in {len(malformed) - 1} more lines" if len(malformed) > 1 else ""
+                fault = f"the covariance has values that are not finite numbers{more}; such a covariance is not used"
+                log.warning("%s: %s.", table.where(malformed[0]), fault)
+            self._covariances = covariances if len(rows) else None
         return self._covariances
 
     @property
@@ -137,13 +115,13 @@ class Trajectory:
         return pose_from_qt(self.qt)
 
     @cached_property
-    def index(self) -> KeyIndex:
+    def index(self) -> tables.KeyIndex:
         """Index of the rows by (timestamp, device_id)."""
-        return KeyIndex(self.timestamps, self.arrow_ids)
+        return tables.KeyIndex(self.timestamps, self.arrow_ids)
 
     def lookup(self, timestamps: ArrayLike, device_ids: Any) -> Floats:
         """Return world_from_device, (n, 4, 4), for n keys; NaN for keys without a pose."""
-        rows = self.index.find(np.atleast_1d(np.asarray(timestamps, np.int64)), as_strings(device_ids))
+        rows = self.index.find(np.atleast_1d(np.asarray(timestamps, np.int64)), tables.as_strings(device_ids))
         poses = np.full((len(rows), 4, 4), np.nan)
         poses[rows >= 0] = pose_from_qt(self.qt[rows[rows >= 0]])
         return poses

@@ -1,7 +1,8 @@
 """Find the number of quarter turns that make the images of each sensor upright, with gravity pointing down.
 
 Headset and robot cameras are mounted rotated, and phones store portrait photographs in landscape. Networks trained on
-upright photographs expect upright images. `toolkit.capture.turning` rotates images, poses and pixel positions.
+upright photographs expect upright images. `k` is always the number of COUNTER-CLOCKWISE quarter turns of the image, as
+in `np.rot90`.
 
     turns = quarter_turns([capture["hl_map"], capture["ios_map"]], world_up=None)
     k = turns.of(capture["hl_query"])
@@ -11,10 +12,11 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.folder import Capture
 from toolkit.capture.session import Rows, Session
@@ -27,8 +29,8 @@ log = logging.getLogger(__name__)
 
 CLEAR = 0.15  # smallest margin of votes that decides; one image has at most 1 vote
 MAJORITY = 2 / 3  # share of the votes that decides for similar sensors, as opposed to the same sensor
+# Share of the votes needed for a decision, for each kind of name by which sensors are looked up.
 SHARES = {"sensor": 0.0, "role": MAJORITY, "name": MAJORITY, "device": MAJORITY}
-"""Share of the votes needed for a decision, for each kind of name by which sensors are looked up."""
 
 
 @dataclass(frozen=True)
@@ -90,19 +92,16 @@ class Turns:
         Args:
             rows: rows of `session.images`; None means all.
         """
-        codes, turns = self._turns_of(session)
+        key = session.path.absolute()
+        if key not in self._of_sensors:
+            self._of_sensors[key] = self._look_up(session)
+        codes, turns = self._of_sensors[key]
         selected = codes[rows if rows is None or isinstance(rows, slice) else np.atleast_1d(np.asarray(rows))]
         return turns[selected.reshape(-1)]
 
     def fingerprint(self, sessions: Sequence[Session]) -> str:
         """Return 16 hex digits that identify the turns of all images of the sessions."""
         return fingerprint([self.of(session).tolist() for session in sessions])
-
-    def _turns_of(self, session: Session) -> tuple[Ints, Ints]:
-        key = session.path.absolute()
-        if key not in self._of_sensors:
-            self._of_sensors[key] = self._look_up(session)
-        return self._of_sensors[key]
 
     def _look_up(self, session: Session) -> tuple[Ints, Ints]:
         """Return the index of each image's sensor, and the turns of each sensor; log them."""
@@ -145,10 +144,8 @@ def quarter_turns(maps: Sequence[Session], world_up: ArrayLike | None = None) ->
     names = pd.concat(tables[1:] or tables, ignore_index=True)
     up_in_cams = np.zeros((0, 3))
     if not len(names):
-        log.warning(
-            "Upright: no image of the map (%s) has a pose, so no image is turned.",
-            ", ".join(session.id for session in maps) or "no session",
-        )
+        sessions = ", ".join(session.id for session in maps) or "no session"
+        log.warning("Upright: no image of the map (%s) has a pose, so no image is turned.", sessions)
     else:
         if up is None:
             up = estimate_world_up(maps)
@@ -191,3 +188,35 @@ def _report(session: Session, roles: pd.Series, turns: Ints) -> None:
         shown = ", ".join(names[:6]) + (f", ... {len(names) - 6} more" if len(names) > 6 else "")
         parts.append(f"{texts.get(int(turn), f'turned by {90 * int(turn)} degrees counter-clockwise')}: {shown}")
     log.info("Upright: %s: %s.", session.id, "; ".join(parts) or "no images")
+
+
+def turn_image(image: NDArray[Any], k: int) -> NDArray[Any]:
+    """Return an image (H, W) or (H, W, 3) after k counter-clockwise quarter turns, contiguous; itself for k = 0."""
+    import cv2
+
+    codes = (cv2.ROTATE_90_COUNTERCLOCKWISE, cv2.ROTATE_180, cv2.ROTATE_90_CLOCKWISE)
+    image = np.ascontiguousarray(image)
+    return image if k % 4 == 0 else cv2.rotate(image, codes[k % 4 - 1])
+
+
+def turn_points(xy: ArrayLike, width: int, height: int, k: int) -> Floats:
+    """Return the pixel positions (N, 2) after k quarter turns of an image of this size, (N, 2).
+
+    The center of the top-left pixel is (0.5, 0.5), before and after.
+    """
+    x, y = np.moveaxis(np.asarray(xy, np.float64), -1, 0)
+    turned = [(x, y), (y, width - x), (width - x, height - y), (height - y, x)][k % 4]
+    return np.stack(turned, axis=-1)
+
+
+def turned_from_cam(k: ArrayLike) -> Floats:
+    """Return turned_from_cam, (..., 4, 4): it maps camera coordinates to those of the camera after k quarter turns.
+
+    The pose of a turned image is world_from_cam @ invert(turned_from_cam(k)).
+
+    Args:
+        k: quarter turns, any shape.
+    """
+    quarter = np.eye(4)
+    quarter[:2, :2] = [[0, 1], [-1, 0]]  # right becomes up (-y)
+    return np.stack([np.linalg.matrix_power(quarter, turn) for turn in range(4)])[np.asarray(k) % 4]

@@ -64,10 +64,8 @@ def estimate_world_up(sessions: Sequence[Session]) -> WorldUp:
     count = len(axes)
     if not count:
         names = ", ".join(session.id for session in sessions) or "none"
-        raise CaptureError(
-            f"No image of the map sessions ({names}) has a pose, so the up direction cannot be estimated: expected "
-            "poses in trajectories.txt. Or set `world_up` in the manifest."
-        )
+        fault = f"No image of the map sessions ({names}) has a pose, so the up direction cannot be estimated"
+        raise CaptureError(f"{fault}: expected poses in trajectories.txt. Or set `world_up` in the manifest.")
     if _look_down_z(axes):
         reason = f"(0, 0, 1), a guess from {count} images that all look along -z: straight down, if z is up"
         return WorldUp(np.array([0.0, 0.0, 1.0]), False, reason)
@@ -269,13 +267,6 @@ def sensor_names(session: Session, sensors: pd.Series) -> pd.DataFrame:
     """
     ids = sensors.reset_index(drop=True).astype(object)
     names = session.sensors.drop_duplicates("sensor_id").set_index("sensor_id")["name"]
-    name = ids.map(names).astype(object).fillna("")
-    kind = f"{session.device}/"
-    return pd.DataFrame(
-        {
-            "sensor": kind + ids,
-            "role": kind + ids.str.replace(r"^.*/", "", regex=True),
-            "name": (kind + name).where(name != "", None),
-            "device": session.device,
-        }
-    )
+    name, kind = ids.map(names).astype(object).fillna(""), f"{session.device}/"
+    named, role = (kind + name).where(name != "", None), kind + ids.str.replace(r"^.*/", "", regex=True)
+    return pd.DataFrame({"sensor": kind + ids, "role": role, "name": named, "device": session.device})

@@ -55,10 +55,9 @@ def write_session(
     path = Path(path)
     write_table(path / "sensors.txt", "sensor_id, name, sensor_type, [sensor_params]+", map(_line, sensors))
     if rigs is not None:
-        poses = ((rig, sensor, np.asarray(pose, np.float64)) for rig, sensor, pose in rigs)
         rows = (
-            (rig, sensor, *(qt_from_pose(pose) if pose.shape == (4, 4) else pose).tolist())
-            for rig, sensor, pose in poses
+            (rig, sensor, *(qt_from_pose(pose) if np.shape(pose) == (4, 4) else np.asarray(pose, np.float64)).tolist())
+            for rig, sensor, pose in rigs
         )
         write_table(path / "rigs.txt", "rig_id, sensor_id, qw, qx, qy, qz, tx, ty, tz", map(_line, rows))
     for file, column, records in (("images.txt", "image_path", images), ("depths.txt", "depth_path", depths)):
@@ -107,10 +106,8 @@ def read_depth(path: str | Path) -> NDArray[np.float32]:
         if depth.dtype != np.uint16 or depth.ndim != 2:
             raise ImageError(f"{depth.dtype} {depth.shape}")
     except ImageError as error:
-        raise CaptureError(
-            f"Depth map {path}: no such file, or not a 16-bit image of one channel ({error}). Expected a 16-bit PNG in "
-            "millimeters."
-        ) from None
+        fault = f"no such file, or not a 16-bit image of one channel ({error})"
+        raise CaptureError(f"Depth map {path}: {fault}. Expected a 16-bit PNG in millimeters.") from None
     return (depth / np.float32(DEPTH_SCALE)).astype(np.float32)
 
 

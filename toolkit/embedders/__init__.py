@@ -80,9 +80,7 @@ def resolve_name(name: str, checkpoint: str | Path | None = None) -> str:
 
 def resolve_model(model: str | list[str], checkpoint: str | Path | None = None) -> str | list[str]:
     """Apply `resolve_name` to a name, or to each of several names."""
-    if isinstance(model, str):
-        return resolve_name(model, checkpoint)
-    return [resolve_name(name, checkpoint) for name in model]
+    return resolve_name(model, checkpoint) if isinstance(model, str) else [resolve_name(n, checkpoint) for n in model]
 
 
 def shows_upright(embedder: Embedder, upright: bool | None) -> bool:
@@ -94,14 +92,12 @@ def create_embedder(name: str, **options: Any) -> Embedder:
     """Create an embedder.
 
     Args:
-        name: a key of `EMBEDDERS`.
+        name: a key of `EMBEDDERS`, or `auto`.
         options: arguments of the embedder: `vocabulary=<file>` for `vlad`; `checkpoint`, `device`, `dtype_compute` and
             `image_size` for `megaloc`.
 
     Raises:
         ManifestError: unknown embedder.
     """
-    if name not in EMBEDDERS:
-        raise ManifestError(f"Unknown embedder {name!r}. {nearest(name, EMBEDDERS)}")
-    embedder: Embedder = pkgutil.resolve_name(EMBEDDERS[name])(**options)
+    embedder: Embedder = pkgutil.resolve_name(EMBEDDERS[resolve_name(name)])(**options)
     return embedder

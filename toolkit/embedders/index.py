@@ -6,7 +6,6 @@ candidates from the vectors on disk.
 
 import logging
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import faiss as typed_faiss
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.embedders.stored import JoinedVectors, StoredVectors, Vectors, blocks, matrix_fingerprints, require_finite
+from toolkit.embedders.stored import StoredVectors, Vectors, blocks, matrix_fingerprints, require_finite
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError, first_line
 from toolkit.files import fingerprint, is_current, read_json, require_whole, sidecar_path, write_atomic, write_sidecar
 from toolkit.geometry import Ints
@@ -24,38 +23,38 @@ from toolkit.manifest import RetrieveSettings
 log = logging.getLogger(__name__)
 faiss: Any = typed_faiss  # its type stubs are incomplete
 
-EXACT = "Flat"
-"""Factory string of the exact search, which needs no index."""
-_BLOCK_BYTES = 128 << 20
-"""Vectors added to an index at a time, bytes of float32: bounds the memory."""
-_TRAIN_BYTES = 1 << 30
-"""Training vectors of an index, at most, bytes of float32."""
-_TRAIN_PER_UNIT = 64
-"""Training vectors per PCA dimension and per cell of an inverted file, if the map has as many."""
-_TRAIN_CODES = 1 << 16
-"""Training vectors of the codes, at least, however few cells there are; PQ needs 256 or more."""
+EXACT = "Flat"  # factory string of the exact search, which needs no index
+_BLOCK_BYTES = 128 << 20  # vectors added to an index at a time, bytes of float32: bounds the memory
+_TRAIN_BYTES = 1 << 30  # training vectors of an index, at most, bytes of float32
+_TRAIN_PER_UNIT = 64  # training vectors per PCA dimension and per cell of an inverted file, if the map has as many
+_TRAIN_CODES = 1 << 16  # training vectors of the codes, at least, however few cells there are; PQ needs 256 or more
 
 
 @dataclass(frozen=True)
 class VectorIndex:
-    """A FAISS index of N vectors."""
+    """FAISS indexes of N vectors, one per descriptor. Each contributes candidates."""
 
-    index: Any
-    candidates: int
-    """Candidates per query."""
-    nprobe: int | None = None
-    """Cells of an inverted file searched per query; None: 1/32 of them, at least 16."""
+    indexes: tuple[Any, ...]
+    count: int  # candidates of each index per query
+    nprobe: int | None = None  # cells of an inverted file searched per query; None: 1/32 of them, at least 16
+
+    @property
+    def candidates(self) -> int:
+        return self.count * len(self.indexes)
 
     def find(self, query: NDArray[np.float32], allowed: NDArray[np.bool_] | None = None) -> Ints:
-        """Return the candidate rows (Q, C) int64 of each query (Q, D); -1 pads missing candidates.
+        """Return the candidate rows (Q, C) int64 of each query (Q, sum of D), which may repeat; -1 pads missing ones.
 
         Args:
             allowed: (N,) rows that may be returned; None: all.
         """
-        count = min(self.candidates, self.index.ntotal)
         selector = None if allowed is None else faiss.IDSelectorBitmap(np.packbits(allowed, bitorder="little"))
-        _, rows = self.index.search(query, count, params=self._parameters(self.index, selector))
-        return np.asarray(rows, np.int64)
+        found, end = [], 0
+        for index in self.indexes:
+            part, end = np.ascontiguousarray(query[:, end : end + index.d]), end + index.d
+            count = min(self.count, index.ntotal)
+            found.append(index.search(part, count, params=self._parameters(index, selector))[1])
+        return np.hstack(found).astype(np.int64, copy=False)
 
     def _parameters(self, index: Any, selector: Any) -> Any:
         index = faiss.downcast_index(index)
@@ -68,31 +67,13 @@ class VectorIndex:
                 return faiss.IVFRaBitQSearchParameters(nprobe=nprobe, qb=index.qb, **selection)
             return faiss.SearchParametersIVF(nprobe=nprobe, **selection)
         if isinstance(index, faiss.IndexHNSW):
-            return faiss.SearchParametersHNSW(efSearch=max(self.candidates, index.hnsw.efSearch), **selection)
+            return faiss.SearchParametersHNSW(efSearch=max(self.count, index.hnsw.efSearch), **selection)
         return faiss.SearchParameters(**selection) if selection else None
-
-
-@dataclass(frozen=True)
-class JoinedIndex:
-    """One index per descriptor of the same images. Every index contributes candidates."""
-
-    indexes: tuple[VectorIndex, ...]
-    dims: tuple[int, ...]
-
-    @property
-    def candidates(self) -> int:
-        return sum(index.candidates for index in self.indexes)
-
-    def find(self, query: NDArray[np.float32], allowed: NDArray[np.bool_] | None = None) -> Ints:
-        """Return the candidate rows (Q, C) of all indexes for each query (Q, sum of D); rows may repeat."""
-        queries = np.split(query, np.cumsum(self.dims)[:-1], axis=1)
-        pairs = zip(self.indexes, queries, strict=True)
-        return np.hstack([index.find(np.ascontiguousarray(columns), allowed) for index, columns in pairs])
 
 
 def make_index(
     embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveSettings, skip_existing: bool = True
-) -> VectorIndex | JoinedIndex | None:
+) -> VectorIndex | None:
     """Build the index of a map, or read the current one; None if none is needed, see `load_index`.
 
     Needs memory for the index and for 1 GB of vectors.
@@ -108,38 +89,19 @@ def make_index(
         ManifestError: FAISS has no such index, or cannot build it from N vectors.
         ValueError: a value is not finite.
     """
-    if isinstance(vectors, JoinedVectors):
-        return _join(vectors, lambda name, part: make_index(embeddings, name, part, settings, skip_existing), map_id)
-    if not _is_needed(settings, vectors):
-        return None
-    path, record = _index_path(embeddings, map_id), _record(vectors, settings)
-    if not (skip_existing and is_current(path, record)):
-        _write(path, _build(vectors, settings.index))
-        write_sidecar(path, record)
-    return _open(path, record, vectors, settings)
-
-
-def _join(
-    vectors: JoinedVectors, open_one: Callable[[str, StoredVectors], VectorIndex | JoinedIndex | None], map_id: str
-) -> JoinedIndex | None:
-    """Return the indexes of all descriptors, or None if one of them needs none."""
-    opened = [open_one(f"{name}/{map_id}", part) for name, part in vectors.parts.items()]
-    indexes = tuple(index for index in opened if isinstance(index, VectorIndex))
-    return JoinedIndex(indexes, vectors.dims) if len(indexes) == len(opened) else None
+    for path, record, part in _files(embeddings, map_id, vectors, settings):
+        if not (skip_existing and is_current(path, record)):
+            _write(path, _build(part, settings.index))
+            write_sidecar(path, record)
+    return load_index(embeddings, map_id, vectors, settings)
 
 
 def is_index_current(embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveSettings) -> bool:
     """Tell whether the map's index is current, or none is needed."""
-    if isinstance(vectors, JoinedVectors):
-        parts = vectors.parts.items()
-        return all(is_index_current(embeddings, f"{name}/{map_id}", part, settings) for name, part in parts)
-    needed = _is_needed(settings, vectors)
-    return not needed or is_current(_index_path(embeddings, map_id), _record(vectors, settings))
+    return all(is_current(path, record) for path, record, _ in _files(embeddings, map_id, vectors, settings))
 
 
-def load_index(
-    embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveSettings
-) -> VectorIndex | JoinedIndex | None:
+def load_index(embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveSettings) -> VectorIndex | None:
     """Read the index that the retrieve stage built for a map; None for an exact search.
 
     The search is exact if the settings say so, or if the map has no more vectors than the index has candidates, cells
@@ -148,14 +110,27 @@ def load_index(
     Raises:
         ArtifactError: the file is missing or damaged, or was made from other vectors.
     """
-    if isinstance(vectors, JoinedVectors):
-        return _join(vectors, lambda name, part: load_index(embeddings, name, part, settings), map_id)
-    if not _is_needed(settings, vectors):
-        return None
-    return _open(_index_path(embeddings, map_id), _record(vectors, settings), vectors, settings)
+    indexes = [_open(*file, settings) for file in _files(embeddings, map_id, vectors, settings)]
+    return (
+        VectorIndex(tuple(indexes), max(settings.index_candidates, settings.topk), settings.nprobe) if indexes else None
+    )
 
 
-def _open(path: Path, record: dict[str, Any], vectors: StoredVectors, settings: RetrieveSettings) -> VectorIndex:
+def _files(
+    embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveSettings
+) -> list[tuple[Path, dict[str, Any], StoredVectors]]:
+    """Return file, record and vectors of the index of each descriptor; none if the search is exact for one of them."""
+    if not all(_is_needed(settings, part) for part in vectors.parts.values()):
+        return []
+    files = []
+    for name, part in vectors.parts.items():
+        identity = [matrix_fingerprints(part.paths), fingerprint(part.rows.tolist())]
+        record = {"index": settings.index, "vectors": identity, "normalize": part.normalize}
+        files.append((embeddings.parent / "index" / name / f"{map_id}.faiss", record, part))
+    return files
+
+
+def _open(path: Path, record: dict[str, Any], vectors: StoredVectors, settings: RetrieveSettings) -> Any:
     try:
         require_whole(path)
         index = faiss.read_index(str(path))
@@ -163,27 +138,21 @@ def _open(path: Path, record: dict[str, Any], vectors: StoredVectors, settings: 
         raise ArtifactError(f"{path}: the map's index cannot be read ({first_line(error)}). Retrieve again.") from error
     expected = fingerprint(record)
     stored = read_json(sidecar_path(path)).get("fingerprint", expected)
-    if stored != expected or (index.ntotal, index.d) != vectors.shape:
-        raise ArtifactError(
-            f"{path}: the map's index was made from other embeddings, poses or settings. Retrieve again."
-        )
-    if settings.faiss_gpu:
-        index = _on_gpu(index, settings.index)
-    return VectorIndex(index, max(settings.index_candidates, settings.topk), settings.nprobe)
+    if stored != expected or (index.ntotal, index.d) != (len(vectors.rows), vectors.dim):
+        made_from = "the map's index was made from other embeddings, poses or settings"
+        raise ArtifactError(f"{path}: {made_from}. Retrieve again.")
+    if not settings.faiss_gpu:
+        return index
+    try:
+        return faiss.index_cpu_to_all_gpus(index)
+    except (AttributeError, NameError, RuntimeError) as error:  # faiss-cpu lacks classes that this function uses
+        fault = f"the installed FAISS cannot put the index {settings.index} on a GPU ({first_line(error)})"
+        raise ToolkitError(f"faiss_gpu: {fault}. Set faiss_gpu: false.") from error
 
 
 def _is_needed(settings: RetrieveSettings, vectors: StoredVectors) -> bool:
-    if settings.index == EXACT:
-        return False
-    empty = _empty(vectors, settings.index)  # owns what `downcast_index` returns: keep it alive
-    index = faiss.downcast_index(empty)
-    least = [settings.index_candidates]
-    if isinstance(index, faiss.IndexPreTransform):
-        least.append(index.chain.at(0).d_out)
-        index = faiss.downcast_index(index.index)
-    if isinstance(index, faiss.IndexIVF):
-        least.append(index.nlist)
-    return len(vectors) > max(least)
+    sizes = map(int, re.findall(r"(?:PCA|IVF)(\d+)", settings.index))  # dimensions and cells
+    return settings.index != EXACT and len(vectors.rows) > max([settings.index_candidates, *sizes])
 
 
 def _empty(vectors: StoredVectors, factory: str) -> Any:
@@ -192,33 +161,21 @@ def _empty(vectors: StoredVectors, factory: str) -> Any:
     try:
         return faiss.index_factory(vectors.dim, factory, metric)
     except RuntimeError as error:
-        raise ManifestError(
-            f"retrieve.index: {factory!r} cannot hold vectors of {vectors.dim} dimensions ({_reason(error)}). "
-            f"{EXACT} searches without an index."
-        ) from error
-
-
-def _record(vectors: StoredVectors, settings: RetrieveSettings) -> dict[str, Any]:
-    identity = [matrix_fingerprints(vectors.paths), fingerprint(vectors.rows.tolist())]
-    return {"index": settings.index, "vectors": identity, "normalize": vectors.normalize}
-
-
-def _index_path(embeddings: Path, map_id: str) -> Path:
-    return embeddings.parent / "index" / f"{map_id}.faiss"
+        fault = f"{factory!r} cannot hold vectors of {vectors.dim} dimensions ({_reason(error)})"
+        raise ManifestError(f"retrieve.index: {fault}. {EXACT} searches without an index.") from error
 
 
 def _build(vectors: StoredVectors, factory: str) -> Any:
-    count, dim = vectors.shape
-    index = _empty(vectors, factory)
+    count, index, every = len(vectors.rows), _empty(vectors, factory), Vectors({"": vectors})
     try:
-        _train(index, vectors)
-        for start, block in blocks(vectors, _BLOCK_BYTES):
+        _train(index, every)
+        for start, block in blocks(every, _BLOCK_BYTES):
             require_finite(block, "database", start)
             index.add(block)
     except RuntimeError as error:
+        fault = f"{factory!r} cannot be built from {count} vectors of {vectors.dim} dimensions ({_reason(error)})"
         raise ManifestError(
-            f"retrieve.index: {factory!r} cannot be built from {count} vectors of {dim} dimensions ({_reason(error)}). "
-            f"Set index: {EXACT}, or index_candidates: {count}: neither builds an index for this map."
+            f"retrieve.index: {fault}. Set index: {EXACT}, or index_candidates: {count}: neither builds an index."
         ) from error
     log.info("built index %s of %d vectors", factory, count)
     return index
@@ -230,7 +187,7 @@ def _write(path: Path, index: Any) -> None:
             faiss.write_index(index, str(temporary))
         except RuntimeError as error:
             raise ToolkitError(
-                f"{path}: the map's index cannot be written ({_reason(error)}). Free some space on the disk."
+                f"{path}: the map's index cannot be written ({_reason(error)}). Free some disk."
             ) from error
 
 
@@ -239,11 +196,10 @@ def _reason(error: RuntimeError) -> str:
     return re.sub(r"^Error in .* at \S+:\d+: (Error: )?", "", str(error).strip().splitlines()[-1])
 
 
-def _train(index: Any, vectors: StoredVectors) -> None:
+def _train(index: Any, vectors: Vectors) -> None:
     """Train PCA, if the index starts with it, then the rest. Behind PCA vectors are shorter, so more fit in memory."""
-    rng = np.random.default_rng(0)
-    index = faiss.downcast_index(index)
-    transforms = list[Callable[[NDArray[np.float32]], NDArray[np.float32]]]()
+    rng, pca = np.random.default_rng(0), list[Any]()
+    last = index = faiss.downcast_index(index)
 
     def sample(dim: int, most: int) -> NDArray[np.float32]:
         count = min(len(vectors), most, _TRAIN_BYTES // (4 * dim))
@@ -251,18 +207,16 @@ def _train(index: Any, vectors: StoredVectors) -> None:
         samples = np.empty((count, dim), np.float32)
         for start, block in blocks(vectors.choose(rows), _BLOCK_BYTES):
             require_finite(block, "database", rows[start:])
-            for apply in transforms:
-                block = apply(block)
-            samples[start : start + len(block)] = block
+            samples[start : start + len(block)] = pca[0].apply(block) if pca else block
         return samples
 
-    if not isinstance(index, faiss.IndexPreTransform):
-        _train_last(index, sample)
-        return
-    pca = faiss.downcast_VectorTransform(index.chain.at(0))
-    _train_pca(pca, sample(pca.d_in, _TRAIN_PER_UNIT * pca.d_out))
-    transforms.append(pca.apply)
-    _train_last(faiss.downcast_index(index.index), sample)
+    if isinstance(index, faiss.IndexPreTransform):
+        last, first = faiss.downcast_index(index.index), faiss.downcast_VectorTransform(index.chain.at(0))
+        _train_pca(first, sample(first.d_in, _TRAIN_PER_UNIT * first.d_out))
+        pca.append(first)
+    if not last.is_trained:
+        most = max(_TRAIN_PER_UNIT * last.nlist, _TRAIN_CODES) if isinstance(last, faiss.IndexIVF) else 1 << 20
+        last.train(sample(last.d, most))
     index.is_trained = True
 
 
@@ -283,19 +237,3 @@ def _train_pca(pca: Any, rows: NDArray[np.float32]) -> None:
     faiss.copy_array_to_vector(directions.T.contiguous().numpy().ravel(), pca.PCAMat)
     pca.prepare_Ab()
     pca.is_trained = True
-
-
-def _train_last(index: Any, sample: Callable[[int, int], NDArray[np.float32]]) -> None:
-    if not index.is_trained:
-        most = max(_TRAIN_PER_UNIT * index.nlist, _TRAIN_CODES) if isinstance(index, faiss.IndexIVF) else 1 << 20
-        index.train(sample(index.d, most))
-
-
-def _on_gpu(index: Any, factory: str) -> Any:
-    try:
-        return faiss.index_cpu_to_all_gpus(index)
-    except (AttributeError, NameError, RuntimeError) as error:  # faiss-cpu lacks classes that this function uses
-        raise ToolkitError(
-            f"faiss_gpu: the installed FAISS cannot put the index {factory} on a GPU ({first_line(error)}). "
-            "Set faiss_gpu: false."
-        ) from error

@@ -12,6 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from toolkit.errors import ManifestError, ToolkitError
+from toolkit.features.network import NOT_FINITE
 from toolkit.files import Remade
 from toolkit.models.compute import Fitting, is_out_of_memory, on_device, resolve_device, resolve_precision, upload
 from toolkit.models.megaloc import PATCH, MegaLoc
@@ -47,9 +48,8 @@ class MegaLocEmbedder(Remade):
             ManifestError, ToolkitError: see `toolkit.models.compute`.
         """
         if not isinstance(image_size, int) or image_size < 9 * PATCH or image_size % PATCH:
-            raise ManifestError(
-                f"image_size is {image_size}; expected a multiple of {PATCH}, at least {9 * PATCH} (322 is usual)."
-            )
+            expected = f"a multiple of {PATCH}, at least {9 * PATCH} (322 is usual)"
+            raise ManifestError(f"image_size is {image_size}; expected {expected}.")
         self._size = image_size
         # Images may be decoded at twice the network's size, as Pillow does for thumbnails. The cosines to descriptors
         # of fully decoded images are then above 1 - 1e-4, the error of bfloat16; at the network's size, 1 - 1e-3.
@@ -67,14 +67,9 @@ class MegaLocEmbedder(Remade):
 
     @property
     def settings(self) -> dict[str, Any]:
+        sizes = {"image_size": self._size, "least_side": self.least_side}
         precision = str(self._dtype).removeprefix("torch.")
-        return {
-            "name": self.name,
-            "weights": self._weights,
-            "image_size": self._size,
-            "least_side": self.least_side,
-            "dtype_compute": precision,
-        }
+        return {"name": self.name, "weights": self._weights, **sizes, "dtype_compute": precision}
 
     def prepare(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Resize an image (H, W, 3) or (H, W), uint8 RGB or gray, to the network's input (S, S, 3).
@@ -115,10 +110,7 @@ class MegaLocEmbedder(Remade):
         with torch.inference_mode():
             vectors = self._fitting(batch).float().cpu().numpy()
         if not np.isfinite(vectors).all():
-            raise ToolkitError(
-                "MegaLoc returned a descriptor that is not finite. Its weights may hold NaN: compare the file with the "
-                "official one. With dtype_compute: float16, numbers may have overflowed: use bfloat16 or float32."
-            )
+            raise ToolkitError(f"MegaLoc returned a descriptor that is not finite. {NOT_FINITE}")
         return vectors
 
     def _forward(self, images: Tensor) -> Tensor:

@@ -8,31 +8,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.masks import Masks
-from toolkit.embedders.index import JoinedIndex, VectorIndex
+from toolkit.embedders.index import VectorIndex
 from toolkit.embedders.stored import Vectors, blocks, require_finite
 from toolkit.errors import ToolkitError
 from toolkit.geometry import Ints
 from toolkit.models.compute import resolve_device
 
 Backend = Literal["faiss", "torch"]
-_BLOCK_BYTES = 128 << 20
-"""Database rows read at a time, bytes of float32."""
-_QUERY_BYTES = 512 << 20
-"""Queries compared in one pass over the database, bytes of float32."""
-_PRODUCTS = 1 << 23
-"""Dot products computed at a time for queries with masks; bounds the memory."""
+_BLOCK_BYTES = 128 << 20  # database rows read at a time, bytes of float32
+_QUERY_BYTES = 512 << 20  # queries compared in one pass over the database, bytes of float32
+# Database rows read at a time for queries with masks. Masks select parts of recordings, so a small block has no allowed
+# rows for most queries, which then skip it.
 _MASKED_ROWS = 1 << 12
-"""Database rows read at a time for queries with masks. Masks select parts of recordings, so a small block has no
-allowed rows for most queries, which then skip it."""
-_EXTRA = 16
-"""Candidates beyond k: rounding in the backend may swap neighbors."""
+_EXTRA = 16  # candidates beyond k: rounding in the backend may swap neighbors
+# Parameter of the generalized harmonic mean. Similarities of n >= 2 unit vectors are never below its pole, -n / 2.
 _GAMMA = 0.5
-"""Parameter of the generalized harmonic mean. Similarities of n >= 2 unit vectors are never below its pole, -n / 2."""
 
 _Floats = NDArray[np.float32]
-_Bools = NDArray[np.bool_]
-Found = tuple[_Floats, Ints]
-"""Scores and rows (Q, K) of the best database vectors of each query, best first."""
+Found = tuple[_Floats, Ints]  # scores and rows (Q, K) of the best database vectors of each query, best first
 _Best = Callable[[_Floats, int, int], Found]
 """Maps a block of the database, the number of its first row, and n to the n best scores and rows of each query, counted
 from the start of the block."""
@@ -46,7 +39,7 @@ def search(
     backend: Backend = "faiss",
     compute_device: str = "cpu",
     faiss_gpu: bool = False,
-    index: VectorIndex | JoinedIndex | None = None,
+    index: VectorIndex | None = None,
     allowed: NDArray[np.bool_] | Masks | None = None,
     dims: Sequence[int] = (),
 ) -> Found:
@@ -56,15 +49,14 @@ def search(
     recomputed in the same way for all backends, so the result does not depend on the backend.
 
     Args:
-        query, database: (Q, D) and (N, D), any float type; `StoredVectors`, `JoinedVectors` and memory-mapped arrays
-            stay on disk.
+        query, database: (Q, D) and (N, D), any float type; `Vectors` and memory-mapped arrays stay on disk.
         k: neighbors per query; at most N are returned.
         backend: `faiss` or `torch`.
         compute_device: where torch computes: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
         faiss_gpu: let faiss compute on the GPU (needs a faiss built for it).
         index: index of the database; it replaces the backend in finding candidates, and may miss neighbors.
         allowed: (N,) rows of the database that may be returned, or a mask per query; None: all. With a mask per query
-            and no index, NumPy computes on the CPU in place of faiss.
+            and no index, torch computes in place of faiss.
         dims: number of columns of each descriptor, in order, if a row holds several side by side. Their similarities
             are fused by torch, whatever the backend, see `fuse`. Empty: one descriptor.
 
@@ -84,24 +76,21 @@ def search(
         raise ValueError(f"k is {k}; expected at least 1.")
     k = min(k, len(vectors))
     scores, indices = np.full((len(query), k), -np.inf, np.float32), np.full((len(query), k), -1, np.int64)
-    if isinstance(allowed, Masks) and (len(allowed), allowed.count) != (len(query), len(vectors)):
-        raise ValueError(
-            f"{len(allowed)} masks of {allowed.count} rows for {len(query)} queries and {len(vectors)} rows."
-        )
+    masks = allowed if isinstance(allowed, Masks) else None
+    if masks is not None and (len(masks), masks.count) != (len(query), len(vectors)):
+        raise ValueError(f"{len(masks)} masks of {masks.count} rows for {len(query)} queries and {len(vectors)} rows.")
     if isinstance(allowed, np.ndarray) and allowed.shape != (len(vectors),):
         raise ValueError(f"allowed has shape {allowed.shape}; expected ({len(vectors)},), one value per database row.")
-    if isinstance(allowed, Masks) and index is not None and k:
-        for numbers, mask in allowed.distinct():
-            queries = query.choose(numbers) if isinstance(query, Vectors) else query[numbers]
-            found = search(queries, vectors, k, backend, compute_device, faiss_gpu, index, mask, dims)
+    if masks is not None and index is not None and k:
+        for numbers, mask in masks.distinct():
+            found = search(_choose(query, numbers), vectors, k, backend, compute_device, faiss_gpu, index, mask, dims)
             scores[numbers], indices[numbers] = found
         return scores, indices
     # An index visits cells near the query, whether allowed or not: with few allowed rows it would find almost none.
     if isinstance(allowed, np.ndarray) and (index is None or np.count_nonzero(allowed) <= index.candidates):
         rows = np.flatnonzero(allowed)
-        chosen = vectors.choose(rows) if isinstance(vectors, Vectors) else vectors[rows]
         if len(rows):
-            found = search(query, chosen, k, backend, compute_device, faiss_gpu, dims=dims)
+            found = search(query, _choose(vectors, rows), k, backend, compute_device, faiss_gpu, dims=dims)
             scores[:, : len(rows)], indices[:, : len(rows)] = found[0], rows[found[1]]
         return scores, indices
     for start, block in blocks(query, _QUERY_BYTES) if k else ():
@@ -112,9 +101,13 @@ def search(
             _rank_candidates(block, vectors, index.find(block, mask), scores[here], indices[here], dims)
             continue
         make = partial(_backend, backend=backend, compute_device=compute_device, faiss_gpu=faiss_gpu, dims=dims)
-        masks = allowed.choose(here) if isinstance(allowed, Masks) else None
-        _search_block(block, vectors, make, masks, scores[here], indices[here], dims)
+        own = None if masks is None else masks.choose(here)
+        _search_block(block, vectors, make, own, scores[here], indices[here], dims)
     return scores, indices
+
+
+def _choose(vectors: _Vectors, rows: Ints) -> _Vectors:
+    return vectors.choose(rows) if isinstance(vectors, Vectors) else vectors[rows]
 
 
 def fuse(similarities: Sequence[Any]) -> Any:
@@ -160,15 +153,18 @@ def _search_block(
     pending, width = np.flatnonzero(lengths), min(count, k + _EXTRA)
     size = _BLOCK_BYTES if masks is None else min(_BLOCK_BYTES, 4 * query.shape[1] * _MASKED_ROWS)
     while len(pending):
-        best = make_backend(
-            query if len(pending) == len(query) else query[pending], None if masks is None else masks.choose(pending)
-        )
-        rough, candidates, longest = _candidates(vectors, best, len(pending), width, size)
+        chosen = query if len(pending) == len(query) else query[pending]
+        find = make_backend(chosen, None if masks is None else masks.choose(pending))
+        rough, candidates, longest = _candidates(vectors, find, len(pending), width, size)
         tolerance = _tolerance(longest * lengths[pending], dims)
         # If the last candidate scores clearly below rank k, no neighbor was lost to rounding in the backend.
         done = (rough[:, -1] < rough[:, k - 1] - tolerance) | (width == count) | np.isneginf(rough[:, -1])
         near = (rough >= (rough[:, k - 1] - 2 * tolerance)[:, None]) & (rough > -np.inf)
-        _rescore(query, vectors, pending[done], candidates[done], near[done], scores, indices, dims)
+        rows, of_rows = pending[done], candidates[done]
+        exact = _rescored(query[rows], vectors, of_rows, near[done], dims)
+        best = np.lexsort((of_rows, -exact), axis=1)[:, :k]
+        scores[rows], indices[rows] = np.take_along_axis(exact, best, 1), np.take_along_axis(of_rows, best, 1)
+        indices[np.isneginf(scores)] = -1
         pending, width = pending[~done], min(count, 4 * width)
 
 
@@ -186,7 +182,7 @@ def _rank_candidates(
         rows = rows[rows >= 0]
         if not len(rows):
             continue
-        block, k = _read(vectors, rows), min(scores.shape[1], len(rows))
+        block, k = np.asarray(vectors[rows], np.float32), min(scores.shape[1], len(rows))
         rough = _fused(vector, block, dims, lambda a, b: b @ a)
         tolerance = _tolerance(np.linalg.norm(block, axis=1).max() * np.linalg.norm(vector), dims)
         near = rough >= np.partition(rough, -k)[-k] - 2 * tolerance
@@ -209,10 +205,6 @@ def _matrix(values: ArrayLike | Vectors, name: str) -> _Vectors:
     if matrix.ndim != 2:
         raise ValueError(f"{name} has shape {matrix.shape}; expected two dimensions, one row per vector.")
     return matrix
-
-
-def _read(vectors: _Vectors, rows: Ints) -> _Floats:
-    return np.asarray(vectors[rows], np.float32)
 
 
 def _candidates(vectors: _Vectors, best: _Best, queries: int, width: int, size: int) -> tuple[_Floats, Ints, float]:
@@ -238,28 +230,20 @@ def _candidates(vectors: _Vectors, best: _Best, queries: int, width: int, size: 
     return scores, indices, longest
 
 
-def _rescore(
-    query: _Floats,
-    vectors: _Vectors,
-    rows: Ints,
-    candidates: Ints,
-    near: _Bools,
-    scores: _Floats,
-    indices: Ints,
-    dims: Sequence[int],
-) -> None:
-    """Fill in exact scores and indices of query rows, from the candidates `near` enough to be among the k best."""
+def _rescored(
+    query: _Floats, vectors: _Vectors, candidates: Ints, near: NDArray[np.bool_], dims: Sequence[int]
+) -> _Floats:
+    """Return the exact scores (Q, C) of the candidates `near` enough to be among the best; -inf for the others."""
     exact = np.full(candidates.shape, -np.inf, np.float32)
     pending, rank = np.nonzero(near)
     order = np.argsort(candidates[pending, rank], kind="stable")  # in the order of the file
     step = max(1, _BLOCK_BYTES // (16 * query.shape[1]))
     for start in range(0, len(order), step):
         part = order[start : start + step]
-        numbers, where = np.unique(candidates[pending[part], rank[part]], return_inverse=True)
-        exact[pending[part], rank[part]] = _products(query[rows[pending[part]]], _read(vectors, numbers)[where], dims)
-    best = np.lexsort((candidates, -exact), axis=1)[:, : scores.shape[1]]
-    scores[rows], indices[rows] = np.take_along_axis(exact, best, 1), np.take_along_axis(candidates, best, 1)
-    indices[np.isneginf(scores)] = -1
+        rows, where = np.unique(candidates[pending[part], rank[part]], return_inverse=True)
+        read = np.asarray(vectors[rows], np.float32)[where]
+        exact[pending[part], rank[part]] = _products(query[pending[part]], read, dims)
+    return exact
 
 
 def _backend(
@@ -268,77 +252,40 @@ def _backend(
     """Return the function that searches a block of the database for the queries."""
     if backend not in ("faiss", "torch"):
         raise ValueError(f"Unknown backend {backend!r}; expected faiss or torch.")
-    by_torch = backend == "torch" or len(dims) > 1
-    if masks is not None:
-        best = partial(_torch_best, device=compute_device, dims=dims) if by_torch else _numpy_best
-        return lambda block, start, number: _masked(query, masks, best, block, start, number)
-    if by_torch:
-        return _torch_backend(query, compute_device, dims)
+    if backend == "torch" or len(dims) > 1 or masks is not None:
+        return _torch_backend(query, masks, compute_device, dims)
     import faiss
 
     if not faiss_gpu:
         return lambda block, _, number: faiss.knn(query, block, number, metric=faiss.METRIC_INNER_PRODUCT)
     if not hasattr(faiss, "StandardGpuResources"):
-        raise ToolkitError(
-            "faiss_gpu is set, but the installed faiss has no GPU support (faiss-cpu). "
-            "Set faiss_gpu: false, or use_faiss: false with compute_device: cuda."
-        )
+        raise ToolkitError("faiss_gpu is set, but the installed faiss has no GPU support. Set faiss_gpu: false.")
     gpu = faiss.StandardGpuResources()
     return lambda block, _, number: faiss.knn_gpu(gpu, query, block, number, metric=faiss.METRIC_INNER_PRODUCT)
 
 
-def _torch_backend(query: _Floats, compute_device: str, dims: Sequence[int]) -> _Best:
+def _torch_backend(query: _Floats, masks: Masks | None, compute_device: str, dims: Sequence[int]) -> _Best:
     import torch
 
     device = resolve_device(compute_device)
     queries = torch.from_numpy(query).to(device)
 
-    def find(block: _Floats, _: int, number: int) -> Found:
+    def find(block: _Floats, start: int, number: int) -> Found:
         rows = torch.from_numpy(block).to(device)
-        most = max(1, _QUERY_BYTES // (4 * len(block) * (len(dims) + 2)))
-        best = [_fused(part, rows, dims, lambda a, b: a @ b.T).topk(number) for part in queries.split(most)]
-        scores, indices = (torch.cat(parts).cpu().numpy() for parts in zip(*best, strict=True))
+        scores, indices = np.full((len(query), number), -np.inf, np.float32), np.zeros((len(query), number), np.int64)
+        step = max(1, _QUERY_BYTES // (4 * len(block) * (len(dims) + 2)))
+        for first in range(0, len(query), step):
+            part: slice | Ints = slice(first, min(first + step, len(query)))
+            allowed = None if masks is None else masks.choose(part).rows(start, start + len(block))
+            if allowed is not None:
+                some = allowed.any(axis=1)
+                part, allowed = first + np.flatnonzero(some), allowed[some]
+                if not len(part):
+                    continue
+            products = _fused(queries[part], rows, dims, lambda a, b: a @ b.T)
+            if allowed is not None:
+                products.masked_fill_(torch.from_numpy(~allowed).to(device), -torch.inf)
+            scores[part], indices[part] = (best.cpu().numpy() for best in products.topk(number))
         return scores, indices
 
     return find
-
-
-def _masked(
-    query: _Floats,
-    masks: Masks,
-    best: Callable[[_Floats, _Floats, _Bools, int], Found],
-    block: _Floats,
-    start: int,
-    number: int,
-) -> Found:
-    """Return the best allowed rows of a block, see `_Best`; -inf where fewer are allowed.
-
-    Args:
-        best: maps queries (n, D), a block (m, D), the allowed rows (n, m) and `number` to the best allowed rows.
-    """
-    scores, indices = np.full((len(query), number), -np.inf, np.float32), np.zeros((len(query), number), np.int64)
-    step = max(1, _PRODUCTS // len(block))
-    for first in range(0, len(query), step):
-        allowed = masks.choose(slice(first, first + step)).rows(start, start + len(block))
-        some = np.flatnonzero(allowed.any(axis=1))
-        if len(some):
-            scores[first + some], indices[first + some] = best(query[first + some], block, allowed[some], number)
-    return scores, indices
-
-
-def _numpy_best(query: _Floats, block: _Floats, allowed: _Bools, number: int) -> Found:
-    scores = query @ block.T
-    scores[~allowed] = -np.inf
-    indices = np.argpartition(scores, -number, axis=1)[:, -number:]
-    return np.take_along_axis(scores, indices, 1), indices
-
-
-def _torch_best(
-    query: _Floats, block: _Floats, allowed: _Bools, number: int, device: str, dims: Sequence[int]
-) -> Found:
-    import torch
-
-    queries, rows, excluded = (torch.from_numpy(array).to(resolve_device(device)) for array in (query, block, ~allowed))
-    products = _fused(queries, rows, dims, lambda a, b: a @ b.T)
-    scores, indices = products.masked_fill_(excluded, -torch.inf).topk(number)
-    return scores.cpu().numpy(), indices.cpu().numpy()

@@ -22,48 +22,14 @@ MANIFEST_COLUMNS = ["row_index", "device_id", "sensor_id", "timestamp", "abs_pat
 
 @dataclass(frozen=True)
 class StoredVectors:
-    """Selected rows of `.npy` matrices that are concatenated along axis 0; read as float32."""
+    """One descriptor of images: selected rows of `.npy` matrices that are concatenated along axis 0."""
 
     paths: tuple[Path, ...]
-    starts: tuple[int, ...]
-    """First row of each file in the concatenation, then the total number of rows."""
+    starts: tuple[int, ...]  # first row of each file in the concatenation, then the total number of rows
     dim: int
-    rows: Ints
-    """The selected rows of the concatenation, in any order."""
-    normalize: bool = False
-    """Whether to scale vectors to length 1 when reading."""
-    embedder: str = ""
-    """Identifies the embedder, see `embedder_fingerprint`; empty: unknown."""
-
-    @classmethod
-    def stack(cls, parts: Sequence["StoredVectors"]) -> "StoredVectors":
-        """Concatenate the rows of several, which have the same dimension."""
-        starts, rows = [0], list[Ints]()
-        for part in parts:
-            rows.append(part.rows + starts[-1])
-            starts += [starts[-1] + start for start in part.starts[1:]]
-        paths = tuple(path for part in parts for path in part.paths)
-        embedder = next((part.embedder for part in parts if part.embedder), "")
-        return replace(parts[0], paths=paths, starts=tuple(starts), rows=np.concatenate(rows), embedder=embedder)
-
-    @property
-    def each(self) -> tuple["StoredVectors", ...]:
-        return (self,)
-
-    @property
-    def dims(self) -> tuple[int, ...]:
-        return (self.dim,)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return len(self.rows), self.dim
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def choose(self, positions: Ints) -> "StoredVectors":
-        """Return the rows at these positions, without reading them."""
-        return replace(self, rows=self.rows[positions])
+    rows: Ints  # the selected rows of the concatenation, in any order
+    normalize: bool = False  # whether to scale vectors to length 1 when reading
+    embedder: str = ""  # identifies the embedder, see `embedder_fingerprint`; empty: unknown
 
     def __getitem__(self, positions: slice | Ints) -> NDArray[np.float32]:
         """Read the rows (n, D) at these positions."""
@@ -87,43 +53,45 @@ class StoredVectors:
 
 
 @dataclass(frozen=True)
-class JoinedVectors:
-    """Several descriptors of the same images; a row holds those of one image side by side."""
+class Vectors:
+    """One or several descriptors of the same N images; a row holds those of an image side by side."""
 
-    parts: Mapping[str, StoredVectors]
-    """Vectors by the name of the descriptor."""
+    parts: Mapping[str, StoredVectors]  # vectors by the name of the descriptor; the name of a single one is empty
 
     @classmethod
-    def stack(cls, parts: Sequence["JoinedVectors"]) -> "JoinedVectors":
-        """Concatenate the rows of several, which have the same descriptors."""
-        names = parts[0].parts
-        return cls({name: StoredVectors.stack([joined.parts[name] for joined in parts]) for name in names})
-
-    @property
-    def each(self) -> tuple[StoredVectors, ...]:
-        return tuple(self.parts.values())
+    def stack(cls, sets: Sequence["Vectors"]) -> "Vectors":
+        """Concatenate the rows of several, which have the same descriptors and dimensions."""
+        stacked = {}
+        for name in sets[0].parts:
+            starts, rows, parts = [0], list[Ints](), [vectors.parts[name] for vectors in sets]
+            for part in parts:
+                rows.append(part.rows + starts[-1])
+                starts += [starts[-1] + start for start in part.starts[1:]]
+            paths = tuple(path for part in parts for path in part.paths)
+            embedder = next((part.embedder for part in parts if part.embedder), "")
+            joined: Any = {"paths": paths, "starts": tuple(starts), "rows": np.concatenate(rows), "embedder": embedder}
+            stacked[name] = replace(parts[0], **joined)
+        return cls(stacked)
 
     @property
     def dims(self) -> tuple[int, ...]:
-        return tuple(part.dim for part in self.each)
+        return tuple(part.dim for part in self.parts.values())
 
     @property
     def shape(self) -> tuple[int, int]:
         return len(self), sum(self.dims)
 
     def __len__(self) -> int:
-        return len(next(iter(self.parts.values())))
+        return len(next(iter(self.parts.values())).rows)
 
-    def choose(self, positions: Ints) -> "JoinedVectors":
+    def choose(self, positions: Ints) -> "Vectors":
         """Return the rows at these positions, without reading them."""
-        return JoinedVectors({name: part.choose(positions) for name, part in self.parts.items()})
+        return Vectors({name: replace(part, rows=part.rows[positions]) for name, part in self.parts.items()})
 
     def __getitem__(self, positions: slice | Ints) -> NDArray[np.float32]:
         """Read the rows (n, sum of D) at these positions."""
-        return np.hstack([part[positions] for part in self.parts.values()])
-
-
-Vectors = StoredVectors | JoinedVectors
+        columns = [part[positions] for part in self.parts.values()]
+        return np.hstack(columns) if len(columns) > 1 else columns[0]
 
 
 def embedder_fingerprint(settings: Mapping[Any, Any]) -> str:
@@ -136,12 +104,10 @@ def embedder_fingerprint(settings: Mapping[Any, Any]) -> str:
 
 def require_same_embedder(vectors: Vectors, others: Vectors) -> None:
     """Raise ArtifactError if two sets of vectors are known to come from different embedders or vocabularies."""
-    for ours, theirs in zip(vectors.each, others.each, strict=True):
+    for ours, theirs in zip(vectors.parts.values(), others.parts.values(), strict=True):
         if ours.embedder and theirs.embedder and ours.embedder != theirs.embedder:
-            raise ArtifactError(
-                f"{ours.paths[0]} and {theirs.paths[0]} were made by different embedders or vocabularies, so their "
-                "vectors cannot be compared. Embed all sessions again."
-            )
+            files = f"{ours.paths[0]} and {theirs.paths[0]} were made by different embedders or vocabularies"
+            raise ArtifactError(f"{files}, so their vectors cannot be compared. Embed all sessions again.")
 
 
 def matrix_fingerprints(paths: Sequence[Path]) -> list[Any]:
@@ -174,7 +140,7 @@ def require_finite(matrix: NDArray[np.float32], name: str, first: int | Ints = 0
         raise ValueError(f"{name} has {bad.sum()} rows with NaN or infinite values, first row {row}.")
 
 
-def open_embeddings(folder: str | Path) -> tuple[StoredVectors, pd.DataFrame]:
+def open_embeddings(folder: str | Path) -> tuple[Vectors, pd.DataFrame]:
     """Open the embeddings of a session, or of one subsession; vectors stay on disk until they are indexed.
 
     Args:
@@ -190,10 +156,8 @@ def open_embeddings(folder: str | Path) -> tuple[StoredVectors, pd.DataFrame]:
     folder = Path(folder)
     manifests = sorted(folder.rglob("manifest.csv"))
     if not manifests:
-        raise ArtifactError(
-            f"No embeddings in {folder}: run the embed stage first (python -m toolkit run ... --only embed)."
-        )
-    parts, tables, dim = list[StoredVectors](), [], 0
+        raise ArtifactError(f"No embeddings in {folder}: run the embed stage first (toolkit run ... --only embed).")
+    parts, tables = list[Vectors](), []
     for manifest in manifests:
         path = manifest.parent / f"{manifest.parent.name}.npy"
         for file in (path, manifest):
@@ -204,25 +168,25 @@ def open_embeddings(folder: str | Path) -> tuple[StoredVectors, pd.DataFrame]:
         except (OSError, ValueError) as error:
             raise ArtifactError(f"Embeddings {path} cannot be read ({error}); embed again.") from error
         if list(table.columns) != MANIFEST_COLUMNS or matrix.ndim != 2 or len(matrix) != len(table):
-            raise ArtifactError(
-                f"{manifest} ({len(table)} rows, {', '.join(table.columns)}) does not fit {path.name} "
-                f"{matrix.shape}; expected columns {', '.join(MANIFEST_COLUMNS)} and one row per vector. Embed again."
+            found = (
+                f"{manifest} ({len(table)} rows, {', '.join(table.columns)}) does not fit {path.name} {matrix.shape}"
             )
-        if parts and matrix.shape[1] != dim:
-            raise ArtifactError(f"{path} has {matrix.shape[1]} dimensions, {manifests[0].parent} {dim}; embed again.")
-        dim = matrix.shape[1]
+            raise ArtifactError(f"{found}; expected {', '.join(MANIFEST_COLUMNS)}, one row per vector. Embed again.")
+        count, dim = matrix.shape
+        if parts and (dim,) != parts[0].dims:
+            raise ArtifactError(f"{path} has {dim} dimensions, {manifests[0].parent} {parts[0].dims[0]}; embed again.")
         match read_json(sidecar_path(path)):
             case {"settings": {"embedder": {**settings}}}:
                 embedder = embedder_fingerprint(settings)
             case _:  # a matrix of another tool
                 embedder = ""
-        part = StoredVectors((path,), (0, len(matrix)), dim, np.arange(len(matrix)), embedder=embedder)
+        part = Vectors({"": StoredVectors((path,), (0, count), dim, np.arange(count), embedder=embedder)})
         for other in parts:
             require_same_embedder(part, other)
         parts.append(part)
         base = folder.parent if manifest.parent == folder else folder
         tables.append(table.assign(subsession=manifest.parent.relative_to(base).as_posix()))
-    return StoredVectors.stack(parts), pd.concat(tables, ignore_index=True)
+    return Vectors.stack(parts), pd.concat(tables, ignore_index=True)
 
 
 def embedding_folders(embeddings: str | Path) -> dict[str, Path]:
@@ -241,20 +205,20 @@ def open_descriptors(embeddings: str | Path, session: str, normalize: bool) -> t
         ArtifactError: see `open_embeddings`; or no image has all descriptors.
     """
     opened = {name: open_embeddings(folder / session) for name, folder in embedding_folders(embeddings).items()}
-    parts = {name: replace(vectors, normalize=normalize) for name, (vectors, _) in opened.items()}
+    parts = {name: replace(vectors.parts[""], normalize=normalize) for name, (vectors, _) in opened.items()}
     tables = [table for _, table in opened.values()]
     if len(parts) == 1:
-        return next(iter(parts.values())), tables[0]
+        return Vectors(parts), tables[0]
     in_all = pd.concat([table["abs_path"] for table in tables]).value_counts() == len(tables)
     table = tables[0][tables[0]["abs_path"].map(in_all)].reset_index(drop=True)
     if not len(table):
         raise ArtifactError(f"{embeddings}: no image of {session} has all of {', '.join(parts)}. Embed again.")
     if missing := len(in_all) - len(table):
-        log.warning("%s: %d of %d images are left out: they lack one of the descriptors %s, see failed.csv",
-                    session, missing, len(in_all), ", ".join(parts))  # fmt: skip
+        lack = f"{missing} of {len(in_all)} images are left out: they lack one of the descriptors {', '.join(parts)}"
+        log.warning("%s: %s, see failed.csv", session, lack)
     positions = [pd.Index(own["abs_path"]).get_indexer(table["abs_path"]) for own in tables]
-    common = {name: vectors.choose(chosen) for (name, vectors), chosen in zip(parts.items(), positions, strict=True)}
-    return JoinedVectors(common), table
+    common = zip(parts.items(), positions, strict=True)
+    return Vectors({name: replace(part, rows=part.rows[chosen]) for (name, part), chosen in common}), table
 
 
 def load_embeddings(folder: str | Path) -> tuple[NDArray[np.float32], pd.DataFrame]:

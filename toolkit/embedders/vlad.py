@@ -28,40 +28,28 @@ from toolkit.threads import fixed_sums
 
 Floats = NDArray[np.float32]
 
-VLAD_FORMAT = 3
-"""Version of the vocabulary, part of its record. Increase when the same images give another one."""
-MAX_WORDS = 256
-"""Largest number of visual words; fewer if the map has too few descriptors."""
-LOCAL_DIM = 64
-"""Dimensions of the local descriptors after PCA whitening."""
+VLAD_FORMAT = 3  # Version of the vocabulary, part of its record. Increase when the same images give another one
+MAX_WORDS = 256  # largest number of visual words; fewer if the map has too few descriptors
+LOCAL_DIM = 64  # dimensions of the local descriptors after PCA whitening
 MIN_SCALE_PX = 2.25
 """Smallest scale of a keypoint: the standard deviation of its blob, in pixels of the stored image. Finer keypoints are
 the first to change with blur, noise and camera resolution."""
-MIN_FEATURES = 300
-"""If fewer keypoints reach `MIN_SCALE_PX`, this many of the coarsest are used instead."""
-MAX_DIM = 512
-"""Largest dimension of the global descriptor; the number of map images limits it too."""
+MIN_FEATURES = 300  # if fewer keypoints reach `MIN_SCALE_PX`, this many of the coarsest are used instead
+MAX_DIM = 512  # largest dimension of the global descriptor; the number of map images limits it too
 PRIOR_IMAGES = 2000
 """Shrinkage of the whitening: a prior that all directions vary equally, with the weight of this many images. Whitening
 learned from a hundred images describes the places they show, not what repeats between places."""
-SAMPLE_DESCRIPTORS = 50_000
-"""Number of local descriptors from which the vocabulary is learned."""
-ITERATIONS = 15
-"""Iterations of k-means."""
+SAMPLE_DESCRIPTORS = 50_000  # number of local descriptors from which the vocabulary is learned
+ITERATIONS = 15  # iterations of k-means
 _SHORTEST = 1e-9  # shorter vectors are rounding errors, and are not normalized
-_CHUNK = 8192
-"""Number of local descriptors that are assigned at once."""
+_CHUNK = 8192  # number of local descriptors that are assigned at once
 _POINT_STEP, _CENTROID_STEP = 2**-11, 2**-8
 """Whitened descriptors and centroids are multiples of these. The centroids' step is coarse, so that one that moves by a
 rounding error is the same again."""
-_PROJECTION_BITS = 14
-"""Bits of an entry of the local projection, an integer, so that products with uint8 descriptors stay below 2**24."""
-_KEY_STEPS = 32
-"""Steps per unit in which a descriptor is hashed: one entry off by the last bit usually leaves the hash as it is."""
+_PROJECTION_BITS = 14  # of an entry of the local projection: products with uint8 descriptors stay below 2**24
+_KEY_STEPS = 32  # per unit, to hash a descriptor: one entry off by the last bit usually leaves the hash as it is
 
-
-_ARRAYS = ("local_projection", "local_offset", "local_scale", "centroids", "projection")
-"""What a vocabulary file holds."""
+_ARRAYS = ("local_projection", "local_offset", "local_scale", "centroids", "projection")  # what a vocabulary file holds
 
 
 class Vlad:
@@ -144,14 +132,11 @@ class Vlad:
             all_keys.append(keys[chosen])
         sample = np.concatenate(parts) if parts else np.zeros((0, 1), np.float32)
         if len(sample) < 2:
-            raise ToolkitError(
-                f"A VLAD vocabulary cannot be learned: {count} map images gave {len(sample)} local features. "
-                f"Check that they can be read and are not blank (`python -m toolkit check CAPTURE`)."
-            )
-        arrays = _whitening(sample, LOCAL_DIM) | {
-            "centroids": np.zeros((0, 0), np.float32),
-            "projection": np.zeros((0, 0), np.float32),
-        }
+            fault = f"{count} map images gave {len(sample)} local features"
+            advice = "Check that they can be read and are not blank (`python -m toolkit check CAPTURE`)"
+            raise ToolkitError(f"A VLAD vocabulary cannot be learned: {fault}. {advice}.")
+        empty = np.zeros((0, 0), np.float32)
+        arrays = _whitening(sample, LOCAL_DIM) | {"centroids": empty, "projection": empty}
         local = cls(arrays)._whitened(sample)
         words = max(1, min(MAX_WORDS, len(local) // 8))
         arrays["centroids"] = _kmeans(local, words, ITERATIONS, np.concatenate(all_keys))

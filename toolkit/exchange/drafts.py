@@ -21,8 +21,8 @@ import pycolmap
 from toolkit.capture import RAW_DATA, Trajectory, write_session
 from toolkit.capture.cameras import camera_text
 from toolkit.capture.devices import SPLITS
-from toolkit.capture.exif import NO_FILE, ORIENTATION, read_header, read_number, time_taken
 from toolkit.capture.folder import IMPORT_RECORD
+from toolkit.capture.images import NO_FILE, ORIENTATION, read_header, read_number, time_taken
 from toolkit.capture.names import EXPECTED_NAME, is_bad_name, note_linked_here
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.files import IMPORTED, write_folder

@@ -21,8 +21,8 @@ import pandas as pd
 import pycolmap
 
 from toolkit.capture import parse_camera
-from toolkit.capture.exif import exif_camera
 from toolkit.capture.folder import IMPORT_RECORD
+from toolkit.capture.images import exif_camera
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.drafts import (

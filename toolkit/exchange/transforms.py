@@ -26,7 +26,7 @@ import numpy as np
 import pycolmap
 
 from toolkit.capture import parse_camera
-from toolkit.capture.exif import is_file, read_header
+from toolkit.capture.images import is_file, read_header
 from toolkit.capture.tables import FARTHEST_M
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.drafts import IMAGE_SUFFIXES, ImportReport, posed_camera, require_convention, start, write_drafts

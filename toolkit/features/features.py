@@ -8,14 +8,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.capture.turning import turn_image, turn_points
+from toolkit.capture.upright import turn_image, turn_points
 from toolkit.errors import ManifestError
 from toolkit.features.rootsift import rootsift_64
 from toolkit.geometry import Ints
 from toolkit.manifest import AUTO, FeaturesSettings, checkpoint_of, nearest
 
-DESCRIPTOR_SCALE = 512.0
-"""Factor by which RootSIFT vectors of length 1 are stored as uint8, as in COLMAP."""
+DESCRIPTOR_SCALE = 512.0  # factor by which RootSIFT vectors of length 1 are stored as uint8, as in COLMAP
 Descriptors = NDArray[np.uint8] | NDArray[np.float16] | NDArray[np.float32]
 
 
@@ -23,18 +22,12 @@ Descriptors = NDArray[np.uint8] | NDArray[np.float16] | NDArray[np.float32]
 class LocalFeatures:
     """Local features of one image as it is stored, strongest response first."""
 
-    keypoints: NDArray[np.float32]
-    """(N, 2) x y, pixels; the center of the top-left pixel is (0.5, 0.5)."""
-    scales: NDArray[np.float32]
-    """(N,) size of the keypoints, as standard deviation of the blob, pixels; 1 for detectors without scale."""
-    scores: NDArray[np.float32]
-    """(N,) response of the detector, larger is better; comparable only within one kind."""
-    descriptors: Descriptors
-    """(N, D) unit vectors; or uint8, non-negative unit vectors times `DESCRIPTOR_SCALE` (RootSIFT)."""
-    image_size: tuple[int, int]
-    """Width and height of the image, pixels."""
-    turns: int = 0
-    """Counter-clockwise quarter turns applied to the image before extraction. Keypoints are in the image as stored."""
+    keypoints: NDArray[np.float32]  # (N, 2) x y, pixels; the center of the top-left pixel is (0.5, 0.5)
+    scales: NDArray[np.float32]  # (N,) sizes: standard deviation of the blob, pixels; 1 for detectors without scale
+    scores: NDArray[np.float32]  # (N,) response of the detector, larger is better; comparable only within one kind
+    descriptors: Descriptors  # (N, D) unit vectors; or uint8, such vectors >= 0 times `DESCRIPTOR_SCALE` (RootSIFT)
+    image_size: tuple[int, int]  # width and height of the image, pixels
+    turns: int = 0  # counter-clockwise quarter turns before extraction; keypoints are in the image as stored
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -47,13 +40,8 @@ class LocalFeatures:
 
     def take(self, part: slice | Ints) -> "LocalFeatures":
         """Return some of the features, by index."""
-        return replace(
-            self,
-            keypoints=self.keypoints[part],
-            scales=self.scales[part],
-            scores=self.scores[part],
-            descriptors=self.descriptors[part],
-        )
+        arrays: Any = {name: getattr(self, name)[part] for name in ("keypoints", "scales", "scores", "descriptors")}
+        return replace(self, **arrays)
 
     def turned(self, turns: int) -> "LocalFeatures":
         """Return the features in the image after counter-clockwise quarter turns of it."""
@@ -66,12 +54,9 @@ class LocalFeatures:
 class Extractor(Protocol):
     """Extracts local features of one kind."""
 
-    color: bool
-    """Whether `extract` takes RGB images (H, W, 3) or gray ones (H, W)."""
-    batch_size: int
-    """The fastest number of images per call."""
-    threaded: bool
-    """Whether it is fastest to call `extract` with one image at a time from several threads."""
+    color: bool  # whether `extract` takes RGB images (H, W, 3) or gray ones (H, W)
+    batch_size: int  # the fastest number of images per call
+    threaded: bool  # whether it is fastest to call `extract` with one image at a time from several threads
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -81,8 +66,7 @@ class Extractor(Protocol):
         """Return the features of uint8 images of any sizes."""
 
 
-Shorten = Callable[[NDArray[np.float32]], NDArray[np.float32]]
-"""Unit descriptors (N, D) -> shorter unit vectors."""
+Shorten = Callable[[NDArray[np.float32]], NDArray[np.float32]]  # unit descriptors (N, D) -> shorter unit vectors
 
 
 def shorten_settings(shorten: Shorten | None) -> dict[str, str]:
@@ -94,24 +78,15 @@ def shorten_settings(shorten: Shorten | None) -> dict[str, str]:
 class FeatureKind:
     """How one kind of local features is extracted and matched. Scores are cosine similarities of descriptors."""
 
-    extractor: str
-    """`module:callable` that makes the extractor; imported when needed."""
-    matchers: tuple[str, ...]
-    """Keys of `toolkit.features.matching.MATCHERS` that can match queries with references, the default first."""
-    ratio: float
-    """Lowe's ratio of `mutual` between a query and a reference; 1: no ratio test."""
-    min_score: float
-    """Smallest score of a `mutual` match between a query and a reference."""
-    epipolar_min_score: float
-    """Smallest score of a match between map images along an epipolar line."""
-    guided_min_score: float
-    """Smallest score of a guided match, near the projection of a map point."""
-    scale_octaves: float
-    """Largest difference between the size of a keypoint and the size that the map predicts, in octaves."""
-    upright: bool = True
-    """Whether the features were learned from upright photographs, so that images are turned upright for them."""
-    shorten: Shorten | None = None
-    """Makes unit descriptors (N, D) shorter before they are compared; None: they are compared as they are."""
+    extractor: str  # `module:callable` that makes the extractor; imported when needed
+    matchers: tuple[str, ...]  # keys of `matching.MATCHERS` for queries and references, the default first
+    ratio: float  # Lowe's ratio of `mutual` between a query and a reference; 1: no ratio test
+    min_score: float  # smallest score of a `mutual` match between a query and a reference
+    epipolar_min_score: float  # smallest score of a match between map images along an epipolar line
+    guided_min_score: float  # smallest score of a guided match, near the projection of a map point
+    scale_octaves: float  # largest difference of a keypoint's size and the size that the map predicts, in octaves
+    upright: bool = True  # whether they were learned from upright images, so that images are turned upright for them
+    shorten: Shorten | None = None  # makes unit descriptors (N, D) shorter before they are compared; None: as they are
 
 
 KINDS: dict[str, FeatureKind] = {
@@ -124,14 +99,14 @@ KINDS: dict[str, FeatureKind] = {
     # Scores of unrelated patches scatter around 0, and similar patches are common: the usual test is a distance below
     # 0.7 (hloc's NN-superpoint), a cosine of 1 - 0.7^2 / 2, without a ratio test. All keypoints have the same size.
     "superpoint": FeatureKind(
-        "toolkit.features.superpoint:SuperPointExtractor", ("lightglue", "mutual"), 1.0, 0.755,
+        "toolkit.features.network:SuperPointExtractor", ("lightglue", "mutual"), 1.0, 0.755,
         epipolar_min_score=0.755, guided_min_score=0.755, scale_octaves=float("inf"),
     ),
     # Measured on photographs by day and by simulated night (STRECHA, STRECHA_HARD): 97 % and 93 % of the mutual matches
     # above 0.7 are correct. In searches within 0.7 degrees, 0.4 % of unrelated features score above 0.5, and 93 % of
     # the true partners by night. With a wrong relative pose, 0.1 % of the matches along epipolar lines remain.
     "aliked": FeatureKind(
-        "toolkit.features.aliked:AlikedExtractor", ("lightglue", "mutual"), 1.0, 0.7,
+        "toolkit.features.network:AlikedExtractor", ("lightglue", "mutual"), 1.0, 0.7,
         epipolar_min_score=0.5, guided_min_score=0.5, scale_octaves=float("inf"),
     ),
 }  # fmt: skip
@@ -162,10 +137,9 @@ def create_extractor(name: str, settings: FeaturesSettings, device: str = "auto"
         ManifestError: unknown features.
         WeightsError: the network has no weights.
     """
-    make = resolve_name(feature_kind(name).extractor)
-    own = getattr(settings, name, None)
-    checkpoint = checkpoint_of(settings.checkpoint, name)
-    extractor: Extractor = make(own) if name == "sift" else make(checkpoint, device, dtype, settings=own)
+    make, own = resolve_name(feature_kind(name).extractor), getattr(settings, name, None)
+    network = checkpoint_of(settings.checkpoint, name), device, dtype
+    extractor: Extractor = make(own) if name == "sift" else make(*network, settings=own)
     return extractor
 
 

@@ -14,14 +14,13 @@ from torch.nn.utils.rnn import pad_sequence
 from toolkit.errors import ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import MATCHER_WEIGHTS, PairMatches
+from toolkit.features.network import NOT_FINITE
 from toolkit.files import Remade
 from toolkit.models.compute import Fitting, in_single_threads, on_device, precision_of_matches, resolve_device
 from toolkit.models.lightglue import LightGlue, official_names
 from toolkit.models.weights import given_or_resolved, load_checkpoint, weights_digest
 
 _DESCRIPTOR_LENGTHS = {"superpoint": 256, "aliked": 128}
-_BATCH = {"cpu": 8}
-_BATCH_ELSEWHERE = 32
 
 
 class LightGlueMatcher(Remade):
@@ -45,11 +44,8 @@ class LightGlueMatcher(Remade):
     ) -> None:
         """
         Args:
-            checkpoint: an official file of the authors or of the hub, or its tensors by name; None: take it from an
-                installed package or a cache, or download it.
-            device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
-            dtype: precision of the layers' matrix products: `float32`, `bfloat16`, `float16`; `auto`: the fastest on
-                the device. Positions and the assignment are always computed in float32.
+            checkpoint, device, dtype: see `NetworkExtractor`; the file is one of the authors or of the hub. Positions
+                and the assignment are always computed in float32.
             batch_size: largest number of pairs per batch; None: depends on the device.
             min_score: smallest confidence of a match, from 0 to 1.
             features: kind of the features, `superpoint` or `aliked`.
@@ -67,8 +63,8 @@ class LightGlueMatcher(Remade):
         self._min_score = min_score
         self._device = resolve_device(device)
         self._dtype = precision_of_matches(dtype, self._device)
-        self.batch_size = batch_size or _BATCH.get(self._device.type, _BATCH_ELSEWHERE)
         self._one_by_one = self._device.type == "cpu"
+        self.batch_size = batch_size or (8 if self._one_by_one else 32)
         source = MATCHER_WEIGHTS["lightglue", features]
         with torch.device("meta"):
             model = LightGlue(_DESCRIPTOR_LENGTHS[features])
@@ -83,10 +79,8 @@ class LightGlueMatcher(Remade):
 
     @property
     def settings(self) -> dict[str, Any]:
-        precision = str(self._dtype).removeprefix("torch.")
-        return {
-            "name": "lightglue", "weights": self._weights, "dtype_compute": precision, "min_score": self._min_score
-        }  # fmt: skip
+        numbers = {"dtype_compute": str(self._dtype).removeprefix("torch."), "min_score": self._min_score}
+        return {"name": "lightglue", "weights": self._weights, **numbers}
 
     def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
         """Return the matches of pairs of images, in the order of the first image's features.
@@ -122,19 +116,14 @@ class LightGlueMatcher(Remade):
         """Return the output of `_forward` for consecutive pairs of images, given by their output of `_encode`."""
         if not self._one_by_one:
             return self._fitting_pairs(pad_sequence(list(states), batch_first=True).unflatten(0, (-1, 2)))
-        return in_single_threads(self._match_one, zip(states[::2], states[1::2], strict=True))
-
-    def _match_one(self, pair: tuple[Tensor, Tensor]) -> Tensor:
-        a, b = (image[None] for image in pair)
-        return self._forward_pairs(a, b)[0]
+        pairs = zip(states[::2], states[1::2], strict=True)
+        return in_single_threads(lambda pair: self._forward_pairs(pair[0][None], pair[1][None])[0], pairs)
 
     def _check(self, features: LocalFeatures) -> None:
         dtype, shape, expected = features.descriptors.dtype, features.descriptors.shape, _DESCRIPTOR_LENGTHS[self._kind]
         if dtype == np.uint8 or shape[1:] != (expected,):
-            raise ToolkitError(
-                f"These weights of LightGlue expect descriptors of {self._kind}, (N, {expected}) unit vectors; "
-                f"found {dtype} {shape}. Use the matcher `mutual` with other features."
-            )
+            wanted = f"descriptors of {self._kind}, (N, {expected}) unit vectors; found {dtype} {shape}"
+            raise ToolkitError(f"These weights of LightGlue expect {wanted}. Use the matcher `mutual`.")
 
     def _encode_new(self, images: Sequence[LocalFeatures], encoded: dict[int, Tensor]) -> None:
         """Add the missing images to `encoded`: by the id of the object, the input (N, 2 + DIM + 1) of `_forward`."""
@@ -144,9 +133,8 @@ class LightGlueMatcher(Remade):
             for features, rows in zip(new, in_single_threads(self._encode, packed), strict=True):
                 encoded[id(features)] = rows[0]
             return
-        count = 2 * self.batch_size
-        for start in range(0, len(new), count):
-            part = new[start : start + count]
+        for start in range(0, len(new), 2 * self.batch_size):
+            part = new[start : start + 2 * self.batch_size]
             batch = pad_sequence([torch.from_numpy(_pack(features)) for features in part], batch_first=True)
             for features, rows in zip(part, self._fitting_images(batch), strict=True):
                 encoded[id(features)] = rows[: len(features)]
@@ -190,10 +178,7 @@ def _pack(features: LocalFeatures) -> NDArray[np.float32]:
 def _unpack(result: NDArray[np.float32]) -> PairMatches:
     """Return the matches of one pair, from its output (N, 2) of `_forward`."""
     if not np.isfinite(result).all():
-        raise ToolkitError(
-            "LightGlue gave a confidence that is not finite. Its weights may contain NaN: compare the file with the "
-            "official one. With float16, numbers may have been too large: use bfloat16 or float32."
-        )
+        raise ToolkitError(f"LightGlue gave a confidence that is not finite. {NOT_FINITE}")
     partners = result[:, 0].astype(np.int64)
     matched = np.flatnonzero(partners >= 0)
     return PairMatches(np.stack([matched, partners[matched]], axis=1), result[matched, 1].copy())

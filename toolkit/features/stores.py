@@ -7,6 +7,7 @@ have one folder of matches per kind and settings, with an item per pair of image
 import logging
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -29,8 +30,7 @@ from toolkit.threads import one_thread
 
 log = logging.getLogger(__name__)
 
-KEPT_IMAGES = 256
-"""Number of images whose features `OnDemandFeatures` keeps in memory."""
+KEPT_IMAGES = 256  # number of images whose features `OnDemandFeatures` keeps in memory
 
 _Todo = tuple[str, str, int, int]
 """An image to extract features from: name, fingerprint of the sources, row of the session, quarter turns."""
@@ -43,28 +43,18 @@ def features_path(out: str | Path, session_id: str, settings: Mapping[str, Any])
     return Path(out) / session_id / f"{settings['name']}-{fingerprint(settings)}"
 
 
+@dataclass(eq=False)
 class FeatureStore(Mapping[str, LocalFeatures]):
     """Read access to the local features of many images, by image name (`Session.image_name`).
 
     Thread-safe. Each access reads a file.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        made_from: Mapping[str, str],
-        failed: Mapping[str, str] | None = None,
-        settings: Mapping[str, Any] | None = None,
-        items: Items | None = None,
-    ):
-        self.path = path
-        self.made_from = dict(made_from)
-        """Name of an image -> fingerprint of the sources of its features."""
-        self.failed = dict(failed or {})
-        """Name of an image that could not be read -> reason."""
-        self.settings = dict(settings or {})
-        """Settings of the extractor; empty if unknown."""
-        self._items = Items(path) if items is None else items
+    path: Path
+    made_from: Mapping[str, str]  # name of an image -> fingerprint of the sources of its features
+    failed: Mapping[str, str] = field(default_factory=dict)  # name of an image that could not be read -> reason
+    settings: Mapping[str, Any] = field(default_factory=dict)  # of the extractor; empty if unknown
+    stored: Items | None = None  # None: opened at the first access
 
     @classmethod
     def open(cls, path: str | Path) -> "FeatureStore":
@@ -83,19 +73,11 @@ class FeatureStore(Mapping[str, LocalFeatures]):
     def _of(cls, path: Path, items: Items, names: Iterable[str]) -> "FeatureStore":
         failed = {name: items.note(name)["failed"] for name in names if items.note(name)}
         made_from = {name: items.source(name) for name in names if name not in failed}
-        return cls(path, made_from, failed, items.made_by, items)
+        return cls(path, made_from, failed, items.made_by or {}, items)
 
     @classmethod
     def of_session(cls, out: str | Path, session_id: str, settings: Mapping[str, Any] | None = None) -> "FeatureStore":
-        """Open the folder with all extracted features of a session.
-
-        Args:
-            out: folder of all features.
-            settings: settings of the extractor; None: SIFT.
-
-        Raises:
-            ArtifactError: the folder is missing or has no features.
-        """
+        """Open a session's features by an extractor's settings, None: SIFT; `out` is the folder of all features."""
         return cls.open(features_path(out, session_id, settings or SiftExtractor().settings))
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -119,7 +101,8 @@ class FeatureStore(Mapping[str, LocalFeatures]):
     def __getitem__(self, name: str) -> LocalFeatures:
         if name not in self.made_from:
             raise KeyError(name)
-        arrays = self._items[name]
+        self.stored = Items(self.path) if self.stored is None else self.stored
+        arrays = self.stored[name]
         width, height, turns = arrays.pop("image").tolist()
         return LocalFeatures(**arrays, image_size=(width, height), turns=turns)
 
@@ -180,12 +163,7 @@ def extract_session(
 
 
 def _extract_into(
-    items: Items,
-    todo: Sequence[_Todo],
-    session: Session,
-    extractor: Extractor,
-    workers: int = 0,
-    label: str = "",
+    items: Items, todo: Sequence[_Todo], session: Session, extractor: Extractor, workers: int = 0, label: str = ""
 ) -> None:
     """Extract the features of images into a folder, or record why that failed. An empty `label` hides the bar."""
     with one_thread():  # images are processed in parallel instead
@@ -217,9 +195,8 @@ class OnDemandFeatures:
     def prepare(self, names: Iterable[str], workers: int, skip_existing: bool = True) -> FeatureStore:
         """Extract the features of images into the folder, and return them; see `extract_session`."""
         rows = np.array([self._session.row_of_name[name] for name in names], np.int64)
-        self._store = extract_session(
-            self._session, self._out, self._extractor, rows, workers, skip_existing, turns=self._turns
-        )
+        made = self._session, self._out, self._extractor, rows, workers, skip_existing
+        self._store = extract_session(*made, turns=self._turns)
         return self._store
 
     def __call__(self, name: str) -> LocalFeatures:
@@ -259,10 +236,8 @@ def _extract(
             return str(error)
         camera = session.camera(sensors[row])
         if image.shape[:2] != (camera.height, camera.width):
-            return (
-                f"Image of {image.shape[1]} x {image.shape[0]} pixels, but sensors.txt says {camera.width} x "
-                f"{camera.height} for {sensors[row]}: {session.image_path(row)}"
-            )
+            said = f"sensors.txt says {camera.width} x {camera.height} for {sensors[row]}: {session.image_path(row)}"
+            return f"Image of {image.shape[1]} x {image.shape[0]} pixels, but {said}"
         return image
 
     def read_and_extract(item: tuple[int, int]) -> LocalFeatures | str:
@@ -306,9 +281,7 @@ class MatchStore:
             KeyError: the folder does not have the pair.
             DamagedError: the matches are not what was written.
         """
-        step = next((step for step in (1, -1) if match_name(*names[::step]) in self._items), 0)
-        if not step:
-            raise KeyError(names)
+        step = 1 if match_name(*names) in self._items else -1
         arrays = self._items[match_name(*names[::step])]
         return PairMatches(arrays["indices"].astype(np.int64)[:, ::step], arrays["scores"].astype(np.float32))
 
@@ -350,10 +323,8 @@ def match_sessions(
     path = matches_path(out, *sessions, made_by)
     with Items(path, made_by, again=not skip_existing) as items:
         readable = dict.fromkeys((name0, name1) for name0, name1 in pairs if name0 in stores[0] and name1 in stores[1])
-        todo = items.left(
-            (match_name(*names), stores[0].made_from[names[0]] + stores[1].made_from[names[1]], *names)
-            for names in readable
-        )
+        sources = (stores[0].made_from[first] + stores[1].made_from[second] for first, second in readable)
+        todo = items.left((match_name(*names), source, *names) for names, source in zip(readable, sources, strict=True))
         label = f"{matcher.settings['name']} {' '.join(sessions)}"
         todo = items.spread(_match_into, todo, (stores, matcher, label), label, "pair", matcher.batch_size)
         _match_into(items, todo, stores, matcher, label)
@@ -361,11 +332,7 @@ def match_sessions(
 
 
 def _match_into(
-    items: Items,
-    todo: Sequence[_ToMatch],
-    stores: tuple[FeatureStore, FeatureStore],
-    matcher: Matcher,
-    label: str,
+    items: Items, todo: Sequence[_ToMatch], stores: tuple[FeatureStore, FeatureStore], matcher: Matcher, label: str
 ) -> None:
     """Add the matches of pairs to a folder."""
     with tqdm(total=len(todo), desc=label, unit="pair", disable=not todo) as bar:

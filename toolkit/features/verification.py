@@ -16,12 +16,9 @@ from toolkit.geometry import Floats, Ints
 from toolkit.manifest import RerankSettings
 from toolkit.threads import fixed_sums
 
-MAP_IMAGES_KEPT = 256
-"""Number of map images whose features stay in memory, about 60 MB."""
-MAX_ERROR_DEG = 0.2
-"""Largest Sampson error of an inlier, as an angle seen from the camera, degrees."""
-MAX_TRIALS = 500
-"""Largest number of RANSAC samples, of five matches each; the best matches are sampled first."""
+MAP_IMAGES_KEPT = 256  # number of map images whose features stay in memory, about 60 MB
+MAX_ERROR_DEG = 0.2  # largest Sampson error of an inlier, as an angle seen from the camera, degrees
+MAX_TRIALS = 500  # largest number of RANSAC samples, of five matches each; the best matches are sampled first
 
 
 class Verifier:
@@ -54,19 +51,10 @@ class Verifier:
         readable = [index for index, name in enumerate(references) if name in self.store]
         map_features = [self._map_features(references[index]) for index in readable]
         all_matches = self.matcher.match([(features, reference) for reference in map_features])
-        counts[0, readable] = [
-            verified_matches(
-                camera,
-                features.keypoints[matches.indices[:, 0]],
-                cameras[index],
-                reference.keypoints[matches.indices[:, 1]],
-                matches.scores,
-                self.settings,
-                tests=len(readable),
-            ).distinct
-            for matches, reference, index in zip(all_matches, map_features, readable, strict=True)
-        ]
-        counts[1, readable] = [len(matches) for matches in all_matches]
+        for matches, reference, index in zip(all_matches, map_features, readable, strict=True):
+            pixels, in_map = features.keypoints[matches.indices[:, 0]], reference.keypoints[matches.indices[:, 1]]
+            pair = camera, pixels, cameras[index], in_map, matches.scores
+            counts[:, index] = verified_matches(*pair, self.settings, tests=len(readable)).distinct, len(matches)
         inliers, matched = counts.tolist()
         return inliers, matched
 
@@ -77,12 +65,9 @@ class Verifier:
 class Verified(NamedTuple):
     """The matches that agree with one essential matrix."""
 
-    inliers: Ints
-    """(A,) indices of these matches."""
-    distinct: int
-    """Their number; those that share a keypoint count once."""
-    essential: Floats
-    """(3, 3) the essential matrix."""
+    inliers: Ints  # (A,) indices of these matches
+    distinct: int  # their number; those that share a keypoint count once
+    essential: Floats  # (3, 3) the essential matrix
 
 
 @fixed_sums

@@ -89,11 +89,6 @@ class Settings(BaseModel):
         except ValidationError as error:
             raise ManifestError(explain(error, cls, cls.__name__)) from None
 
-    @classmethod
-    def needed(cls) -> list[str]:
-        """Return the names of the fields without a default."""
-        return [name for name, field in cls.model_fields.items() if field.is_required()]
-
     def given(self) -> dict[str, Any]:
         """Return the explicitly set fields as plain values; fields left at their defaults are absent."""
         return self.model_dump(mode="json", exclude_unset=True)
@@ -143,8 +138,9 @@ def describe(model: type[Settings], indent: str = "") -> Iterator[str]:
         if field.is_required():
             continue
         inner, default = nested_model(field.annotation), field.get_default()
+        needed = [name for name, of_inner in (inner.model_fields if inner else {}).items() if of_inner.is_required()]
         yield from (f"{indent}# {line}".rstrip() for line in (field.description or "").splitlines())
-        if inner is not None and issubclass(inner, Settings) and not inner.needed():
+        if inner is not None and issubclass(inner, Settings) and not needed:
             off = "" if isinstance(default, Settings) else "# "
             yield f"{indent}{off}{name}:"
             yield from (f"{off}{line}" for line in describe(inner, indent + "  "))
@@ -224,7 +220,7 @@ class RetrieveSettings(Settings):
     """References per query image."""
     use_faiss: bool = True
     """Exact search with FAISS (true) or torch (false), with the same result. An approximate index always uses FAISS;
-    fused similarities of several descriptors always use torch."""
+    fused similarities of several descriptors, and searches with masks, always use torch."""
     faiss_gpu: bool = False
     """Run FAISS on the GPU; needs a FAISS built with GPU support."""
     normalize: bool = True
@@ -257,7 +253,7 @@ class SiftSettings(Settings):
 class SuperPointSettings(Settings):
     """SuperPoint keypoints and descriptors."""
 
-    constants = {"features/superpoint.py": "threshold nms_radius border"}
+    constants = {"features/network.py": "threshold nms_radius border"}
     max_long_side: Annotated[int, Field(ge=8)] = 1024
     """Larger images are reduced to this length of the longer side, pixels; the aspect ratio is kept."""
     max_keypoints: Positive = 2048
@@ -270,7 +266,7 @@ AlikedModel = Literal["aliked-n16", "aliked-n16rot", "aliked-n32", "aliked-t16"]
 class AlikedSettings(Settings):
     """ALIKED keypoints and descriptors."""
 
-    constants = {"features/aliked.py": "min_long_side threshold nms_radius"}
+    constants = {"features/network.py": "min_long_side threshold nms_radius"}
     model: AlikedModel = "aliked-n16"
     """Variant of the network: n16rot tolerates more in-plane rotation, n32 is larger, t16 is smaller."""
     max_long_side: Annotated[int, Field(ge=32)] = 1024

@@ -237,7 +237,7 @@ class LocalMap:
         point = np.concatenate([one.obs_point + start for one, start in zip(maps, starts[:-1], strict=True)])
         order = np.argsort(image, kind="stable")
         names_of = ("points", "colors", "obs_keypoint", "noise_px")
-        joined = {name: np.concatenate([getattr(one, name) for one in maps]) for name in names_of}
+        joined: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in maps]) for name in names_of}
         joined |= {"obs_image": image[order], "obs_keypoint": joined["obs_keypoint"][order], "obs_point": point[order]}
         pooled = replace(first, image_names=names, cameras=cameras, world_from_cams=poses, **joined)
         return pooled._sharing(first) if same else pooled

@@ -20,22 +20,14 @@ from torch.nn.utils.fusion import fuse_conv_bn_weights
 from toolkit.models.compute import linear
 from toolkit.models.weights import load_checkpoint
 
-
-@dataclass(frozen=True)
-class _Sizes:
-    channels: tuple[int, int, int, int]
-    """Channels of the encoder's four levels; the last is also the length of a descriptor."""
-    samples: int
-    """Positions around a keypoint at which its descriptor samples features."""
-
-
 MODELS = {
-    "aliked-t16": _Sizes((8, 16, 32, 64), 16),
-    "aliked-n16": _Sizes((16, 32, 64, 128), 16),
-    "aliked-n16rot": _Sizes((16, 32, 64, 128), 16),
-    "aliked-n32": _Sizes((16, 32, 64, 128), 32),
+    "aliked-t16": ((8, 16, 32, 64), 16),
+    "aliked-n16": ((16, 32, 64, 128), 16),
+    "aliked-n16rot": ((16, 32, 64, 128), 16),
+    "aliked-n32": ((16, 32, 64, 128), 32),
 }
-"""The variants of the network."""
+"""The variants of the network: channels of the encoder's four levels, of which the last is also the length of a
+descriptor, and the number of positions around a keypoint at which its descriptor samples features."""
 _COARSEST = 32  # side of a pixel of the coarsest level, image pixels
 _PATCH = 3  # side of the patch around a keypoint from which the sample positions are computed, pixels
 _TEMPERATURE = 0.1  # of the soft maximum that gives keypoints subpixel positions
@@ -50,22 +42,20 @@ class Aliked(nn.Module):
 
     def __init__(self, model: str = "aliked-n16") -> None:
         super().__init__()
-        sizes = MODELS[model]
-        c1, c2, c3, c4 = sizes.channels
+        channels, samples = MODELS[model]
+        c1, c2, c3, c4 = channels
         self.block1 = _Block(3, c1, deformable=False, residual=False)
         self.block2 = _Block(c1, c2, deformable=False)
         self.block3 = _Block(c2, c3, deformable=True)
         self.block4 = _Block(c3, c4, deformable=True)
-        self.conv1, self.conv2, self.conv3, self.conv4 = (
-            nn.Conv2d(channels, c4 // 4, 1, bias=False) for channels in sizes.channels
-        )
+        self.conv1, self.conv2, self.conv3, self.conv4 = (nn.Conv2d(c, c4 // 4, 1, bias=False) for c in channels)
         self.score_head = nn.Sequential(
             nn.Conv2d(c4, 8, 1, bias=False), nn.SELU(inplace=True),
             nn.Conv2d(8, 4, 3, padding=1, bias=False), nn.SELU(inplace=True),
             nn.Conv2d(4, 4, 3, padding=1, bias=False), nn.SELU(inplace=True),
             nn.Conv2d(4, 1, 3, padding=1, bias=False),
         )  # fmt: skip
-        self.desc_head = _DescriptorHead(c4, sizes.samples)
+        self.desc_head = _DescriptorHead(c4, samples)
         self.descriptor_length = c4
 
     @classmethod

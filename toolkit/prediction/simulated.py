@@ -89,10 +89,6 @@ class SimulatedPredictor:
         return dict(self._noise)
 
     @cached_property
-    def _rows(self) -> dict[str, int]:
-        return {name: row for s in self._sessions.values() for name, row in s.row_of_name.items()}
-
-    @cached_property
     def _truth(self) -> dict[str, Floats]:
         return {
             name: pose
@@ -100,7 +96,7 @@ class SimulatedPredictor:
             for name, pose in zip(session.image_names, session.world_from_cam(ground_truth=True), strict=True)
         }
 
-    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
         """Return a prediction for each group of views.
 
         Raises:
@@ -166,7 +162,7 @@ class SimulatedPredictor:
         points = local_map.points[np.unique(local_map.observations(local_map.index_of[view.name])[1])]
         if len(points) >= _FEW_POINTS:
             return points
-        seen = self._depth_maps[session].of(self._rows[view.name])
+        seen = self._depth_maps[session].of(self._sessions[session].row_of_name[view.name])
         if not len(seen):
             return points
         return geometry.transform(self._truth[view.name], lifted(view.camera, seen.pixels, seen.depth_m))

@@ -44,7 +44,7 @@ from toolkit.pose.result import QueryResult, Status
 from toolkit.prediction.feed_forward import FeedForwardLocalizer
 from toolkit.prediction.hybrid import HybridLocalizer
 from toolkit.prediction.interface import Predictor
-from toolkit.prediction.registry import open_predictor
+from toolkit.prediction.network import open_predictor
 from toolkit.scene.opening import (
     RETRIEVAL,
     SESSIONS_ROOT,

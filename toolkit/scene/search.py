@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolkit.capture import Session
-from toolkit.capture.turning import turn_image
+from toolkit.capture.upright import turn_image
 from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_folders, open_descriptors, shows_upright
-from toolkit.embedders.index import JoinedIndex, VectorIndex, load_index
+from toolkit.embedders.index import VectorIndex, load_index
 from toolkit.embedders.search import search
 from toolkit.embedders.stored import embedder_fingerprint
 from toolkit.errors import ArtifactError
@@ -154,7 +154,7 @@ class ReferenceSearch:
             create_embedder(name, **({"vocabulary": folder / "vlad.npz"} if name == "vlad" else learned))
             for name, folder in zip(settings.models, folders, strict=True)
         ]
-        for embedder, vectors in zip(embedders, self._stored[0].each, strict=True):
+        for embedder, vectors in zip(embedders, self._stored[0].parts.values(), strict=True):
             if vectors.embedder not in ("", embedder_fingerprint(embedder.settings)):
                 raise ArtifactError(
                     f"{vectors.paths[0]} was made by another embedder or vocabulary than the run's {embedder.name} of "
@@ -179,7 +179,7 @@ class ReferenceSearch:
         return vectors[:] if small else vectors, rows
 
     @cached_property
-    def _index(self) -> VectorIndex | JoinedIndex | None:
+    def _index(self) -> VectorIndex | None:
         """The index of the descriptors, if the run has one."""
         settings = self.retrieve_settings.model_copy(update={"faiss_gpu": False})  # this machine may have no GPU
         return load_index(self.files.embeddings, self.session.id, self._stored[0], settings)

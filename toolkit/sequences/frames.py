@@ -150,7 +150,8 @@ class SequenceLocalizer:
         """See `localize_sequence`; `settings.length_s` is the window."""
         self.settings = self._drift = SequenceSettings.of({"online": True}, settings)
         self._localize = partial(_localize, map_, rig_from_cams, turns)
-        self._timestamps, self._poses = list[int](), list[Floats]()
+        self._motion = Odometry(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
+        """Frames of the window."""
         self._queries = queries_of({})
         """Single poses of the current piece, including those found again."""
         self._solved: tuple[int, PlacedPiece] | None = None
@@ -178,47 +179,40 @@ class SequenceLocalizer:
         pose = np.asarray(odom_from_rig, np.float64)
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise ValueError(f"odom_from_rig: found {pose.tolist()}, expected a pose (4, 4) of finite numbers.")
-        if self._timestamps and timestamp <= self._timestamps[-1]:
-            raise ValueError(f"timestamp: found {timestamp} after {self._timestamps[-1]}, expected a later one.")
+        before = self._motion.timestamps
+        if len(before) and timestamp <= before[-1]:
+            raise ValueError(f"timestamp: found {timestamp} after {before[-1]}, expected a later one.")
         cams: Any = cameras
         # Before the frame is added, so that it can be added again after an error.
         self.single = None if image is None else self._localize(image, cams)
-        self._timestamps.append(int(timestamp))
-        self._poses.append(pose)
-        latest = self._since(-4)
+        self._motion = Odometry(np.append(before, timestamp), np.concatenate([self._motion.odom_from_rig, pose[None]]))
+        latest = self._motion.part(slice(-4, None))
         if latest.split()[-1].start == len(latest) - 1:  # tracking was lost: start a new piece
-            del self._timestamps[:-1], self._poses[:-1]
-            self._queries, self._solved = queries_of({}), None
+            self._motion, self._queries, self._solved = self._motion.part(slice(-1, None)), queries_of({}), None
         if self.single is None:
             return self._extrapolate()
-        self._queries = self._queries.joined(queries_of({len(self._poses) - 1: self.single}))
+        self._queries = self._queries.joined(queries_of({len(self._motion) - 1: self.single}))
         return self._solve(image, cams)
 
-    def _since(self, start: int) -> Odometry:
-        return Odometry(np.array(self._timestamps[start:], np.int64), np.stack(self._poses[start:]))
-
     def _drop_before(self, start: int) -> None:
-        del self._timestamps[:start], self._poses[:start]
-        self._queries = self._queries.part(slice(start, start + len(self._poses)))
+        self._queries = self._queries.part(slice(start, len(self._motion)))
+        self._motion = self._motion.part(slice(start, None))
 
     def _solve(self, image: Images, cameras: Cameras) -> QueryResult:
         if self.settings.length_s is not None:
-            oldest = self._timestamps[-1] - self.settings.length_s * 1e6
-            self._drop_before(int(np.searchsorted(self._timestamps, oldest)))
-        self._drift = with_measured_drift([(self._since(0), self._queries)], self.settings)
-        self._drop_before(cut(self._since(0), self._queries, self._drift)[-1].start)
-        window = self._since(0)
+            times = self._motion.timestamps
+            self._drop_before(int(np.searchsorted(times, times[-1] - self.settings.length_s * 1e6)))
+        self._drift = with_measured_drift([(self._motion, self._queries)], self.settings)
+        self._drop_before(cut(self._motion, self._queries, self._drift)[-1].start)
         offline = self._drift.model_copy(update={"online": False, "length_s": None})
 
         def localize_again(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
             return [self._localize(image, cameras, near) for _, near in todo]
 
         again = localize_again if self.settings.relocalize else None
-        done = localize_piece(window, self._queries, np.array([len(window) - 1]), offline, again)
+        done = localize_piece(self._motion, self._queries, np.array([len(self._motion) - 1]), offline, again)
         self._queries, placed = done.queries, done.placed
-        self._solved = len(window) - 1, placed
-        if not np.isfinite(placed.world_from_rig[-1]).all():
-            return QueryResult(*Status.parse(str(placed.status[-1])), found_by="sequence")
+        self._solved = len(self._motion) - 1, placed
         return self._estimate(placed.world_from_rig[-1], placed.covariances[-1], str(placed.status[-1]))
 
     def _extrapolate(self) -> QueryResult:
@@ -227,9 +221,7 @@ class SequenceLocalizer:
             return QueryResult.failed("no query of this piece has a pose", found_by="sequence")
         last, placed = self._solved
         status = str(placed.status[-1])
-        if not np.isfinite(placed.world_from_rig[-1]).all():
-            return QueryResult(*Status.parse(status), found_by="sequence")
-        since = self._since(last).scaled(placed.scale)
+        since = self._motion.part(slice(last, None)).scaled(placed.scale)
         step = geometry.invert(since.odom_from_rig[0]) @ since.odom_from_rig[-1]
         rotation_std, position_std = since.drift(self._drift, np.array([0]), np.array([len(since) - 1]))
         position_std = np.hypot(position_std, self.settings.scale_std * np.linalg.norm(step[:3, 3]))
@@ -240,11 +232,7 @@ class SequenceLocalizer:
 
     def _estimate(self, pose: Floats, covariance: Floats, status: str) -> QueryResult:
         parsed, reason = Status.parse(status)
-        return replace(
-            self.single or QueryResult(parsed),
-            status=parsed,
-            reason=reason,
-            world_from_rig=pose,
-            covariance=covariance,
-            found_by="sequence",
-        )
+        if not np.isfinite(pose).all():
+            return QueryResult(parsed, reason, found_by="sequence")
+        single = replace(self.single or QueryResult(parsed), status=parsed, reason=reason)
+        return replace(single, world_from_rig=pose, covariance=covariance, found_by="sequence")
