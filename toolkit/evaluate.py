@@ -112,15 +112,14 @@ def evaluate_scene(
         maps = [map_ for map_, _ in _chosen((devices[0], [query]), pairs)]
         if not maps:
             continue
-        reason = _unreadable(capture, f"{query}_query")
-        if not reason:
+        reason = ""
+        try:
             session = capture[f"{query}_query"]
-            tables = [_table_of(poses_dir, capture.name, map_, query) for map_ in maps]
-            try:
-                keys, truth = _queries_with_truth(session, queries, messages)
-                messages += metrics.camera_messages(session, [table for table in tables if table is not None])
-            except CaptureError as error:
-                reason = str(error)
+            keys, truth = _queries_with_truth(session, queries, messages)
+            tables = (_table_of(poses_dir, capture.name, map_, query) for map_ in maps)
+            messages += metrics.camera_messages(session, [table for table in tables if table is not None])
+        except CaptureError as error:
+            reason = str(error)
         for map_ in maps:
             pair, name = {"map_device": map_, "query_device": query}, pair_name(capture.name, map_, query)
             poses = Path(poses_dir) / f"{name}.txt"
