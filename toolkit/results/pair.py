@@ -30,7 +30,7 @@ from toolkit.files import (
 )  # fmt: skip
 from toolkit.geometry import Floats
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.result import QueryResult, Status, statuses
+from toolkit.pose.result import QueryResult, Status
 from toolkit.results.metrics import is_posed, length_unit, pose_errors
 from toolkit.store.hdf5 import HDF5_ERRORS, has_group, read_group
 
@@ -86,11 +86,6 @@ class PairResults:
     @property
     def h5(self) -> Path:
         return self.path.with_suffix(".h5")
-
-    @property
-    def status(self) -> pd.Series:
-        """Status of each query without its reason: `ok`, `low_confidence`, `failed`."""
-        return statuses(self.table["status"])
 
     @cached_property
     def trajectory(self) -> Trajectory:
