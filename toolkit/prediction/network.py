@@ -157,7 +157,7 @@ class NetworkPredictor:
     def _model(self) -> Any:
         return _load_network(self._architecture, self.checkpoint, self._dtype, self._device, self._compile)
 
-    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
         """Return a prediction for each group of views. The first view of a group is the query.
 
         A prediction has as many views as its group. Views that the network did not get have NaN in `model_from_cams`
