@@ -21,7 +21,7 @@ from toolkit.figures.top_view import draw_scene
 from toolkit.files import pair_name, require_current, sidecar_path, write_sidecar
 from toolkit.geometry import Floats
 from toolkit.manifest import VisualizeSettings
-from toolkit.results.images import LocalizedPair, support_of, sure_points
+from toolkit.results.localized import LocalizedPair, support_of, sure_points
 from toolkit.results.metrics import is_posed, worst_first
 from toolkit.runs.pairs import PairRows, left_out
 from toolkit.viewer.queries import record_localizations

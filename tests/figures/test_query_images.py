@@ -11,7 +11,7 @@ from toolkit.figures.query_images import WorstQuery, draw_localization, draw_wor
 from toolkit.figures.style import error_colors, new_figure, save_figure
 from toolkit.figures.top_view import draw_scene
 from toolkit.geometry import make_pose, project
-from toolkit.results.images import QueryDetails, ShownImage
+from toolkit.results.localized import QueryDetails, ShownImage
 
 CAMERA = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[50, 50, 32, 24])
 HIGH = pycolmap.Camera(model="PINHOLE", width=64, height=96, params=[50, 50, 32, 48])

@@ -1,6 +1,7 @@
 """VGGT as a predictor: groups, batches, the cache, memory and bad images, with a small network of its kind."""
 
 import logging
+import threading
 import weakref
 from collections.abc import Callable
 from pathlib import Path

@@ -16,7 +16,7 @@ from toolkit.capture import Capture, Trajectory, write_depth, write_session
 from toolkit.errors import ArtifactError, CaptureError
 from toolkit.geometry import make_pose, quaternion_to_rotation
 from toolkit.mapping.local_map import LocalMap
-from toolkit.results.images import Localizations, QueryDetails, ShownImage
+from toolkit.results.localized import Localizations, QueryDetails, ShownImage
 from toolkit.viewer.blueprint import scene_view, shown_intrinsics, small_jpeg, spawn_viewer
 from toolkit.viewer.queries import record_localizations
 from toolkit.viewer.sessions import record_session, session_tracks

@@ -17,7 +17,7 @@ from toolkit.geometry import Floats, shifted
 from toolkit.manifest import LocalizeSettings
 from toolkit.pose.confidence import bounded_by_rivals
 from toolkit.pose.result import CAMERA, QueryResult, Status
-from toolkit.results.images import LocalizedPair, QueryDetails, sure_points
+from toolkit.results.localized import LocalizedPair, QueryDetails, sure_points
 from toolkit.results.metrics import is_posed, pose_errors
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from toolkit.figures.style import shown
 from toolkit.files import SceneFiles, image_name, pair_devices, read_references, require_current
 from toolkit.manifest import LocalizeSettings, nearest
 from toolkit.pose.result import QueryResult
-from toolkit.results.images import LocalizedPair
+from toolkit.results.localized import LocalizedPair
 from toolkit.results.metrics import worst_first
 from toolkit.runs.kernel import TEXT_BARS
 from toolkit.scene.map import WITHOUT_FEATURES, Map

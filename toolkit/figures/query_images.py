@@ -13,7 +13,7 @@ from toolkit.capture.images import read_for_display
 from toolkit.figures.style import ESTIMATED, GREEN, SKY, inches_to_pixels, new_figure, styled
 from toolkit.files import own_name
 from toolkit.geometry import Floats, pose_error, project
-from toolkit.results.images import QueryDetails, ShownImage
+from toolkit.results.localized import QueryDetails, ShownImage
 from toolkit.results.metrics import is_posed
 
 if TYPE_CHECKING:

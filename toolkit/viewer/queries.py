@@ -17,7 +17,7 @@ from toolkit.capture.images import prefetch, read_for_display
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.figures.style import ESTIMATED, GREEN, MAP, ORANGE, SKY, TRUE, draw_error_legend, error_colors
 from toolkit.geometry import Floats, local_origin, project, shifted
-from toolkit.results.images import REFERENCES, Localizations, QueryDetails, ShownImage, support_of
+from toolkit.results.localized import REFERENCES, Localizations, QueryDetails, ShownImage, support_of
 from toolkit.results.metrics import is_posed
 from toolkit.viewer import blueprint as viewer
 

@@ -23,7 +23,7 @@ from toolkit.errors import ArtifactError, CaptureError, ImageError
 from toolkit.figures.style import ORANGE
 from toolkit.files import pair_devices, write_sidecar
 from toolkit.geometry import Floats, Ints, local_origin, shifted
-from toolkit.results.images import sure_points
+from toolkit.results.localized import sure_points
 from toolkit.results.metrics import is_posed
 from toolkit.results.pair import PairResults, load_maps, map_files
 from toolkit.viewer import blueprint as viewer

@@ -13,9 +13,9 @@ from toolkit.figures.query_images import draw_localization
 from toolkit.files import write_sidecar
 from toolkit.geometry import make_pose
 from toolkit.mapping.local_map import LocalMap
-from toolkit.results import images
+from toolkit.results import localized as images
 from toolkit.results import pair as localized
-from toolkit.results.images import LocalizedPair, sure_points
+from toolkit.results.localized import LocalizedPair, sure_points
 from toolkit.results.pair import load_maps, map_files
 
 INLIERS = [True, False, True, True, False, True]
