@@ -25,6 +25,12 @@ def test_a_run_has_its_settings_maps_and_queries(small_run: Path, released_weigh
     assert set(of_device["status"]) == set(
         pd.concat([table for stem, table in tables.items() if f"_map_{device}_query_" in stem])["status"]
     )
+    name = f"{device}_query/raw_data/{run.queries.query('query_device == @device')['image'].iloc[0]}"
+    query = run[name]
+    assert query.views[0].image == run.map(device).capture[f"{device}_query"].path / name.partition("/")[2]
+    assert run.map(device).locate(query).status == of_device["status"].iloc[0].partition(":")[0]
+    with pytest.raises(ArtifactError, match=r"0 query images with the name 'nowhere.jpg'"):
+        run["nowhere.jpg"]
 
 
 def test_what_is_no_run_names_those_beside_it(tmp_path: Path) -> None:
