@@ -25,10 +25,12 @@ def test_a_run_has_its_settings_maps_and_queries(small_run: Path, released_weigh
     assert set(of_device["status"]) == set(
         pd.concat([table for stem, table in tables.items() if f"_map_{device}_query_" in stem])["status"]
     )
-    name = f"{device}_query/raw_data/{run.queries.query('query_device == @device')['image'].iloc[0]}"
+    row = of_device.iloc[-1]
+    name, *others = row["image"].split(";")
     query = run[name]
-    assert query.views[0].image == run.map(device).capture[f"{device}_query"].path / name.partition("/")[2]
-    assert run.map(device).locate(query).status == of_device["status"].iloc[0].partition(":")[0]
+    folder = run.map(device).capture[f"{row['query_device']}_query"].path / "raw_data"
+    assert {view.image for view in query.views} == {folder / image for image in (name, *others)}
+    assert run.map(device).locate(query).status == row["status"].partition(":")[0]
     with pytest.raises(ArtifactError, match=r"0 query images with the name 'nowhere.jpg'"):
         run["nowhere.jpg"]
 
