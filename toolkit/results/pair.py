@@ -30,7 +30,7 @@ from toolkit.files import (
 )  # fmt: skip
 from toolkit.geometry import Floats
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.result import QueryResult, Status, statuses
+from toolkit.pose.result import QueryResult, Status
 from toolkit.results.metrics import is_posed, length_unit, pose_errors
 from toolkit.store.hdf5 import HDF5_ERRORS, has_group, read_group
 
@@ -53,17 +53,22 @@ class PairResults:
     """`poses/<pair>.csv`: one row per query, `status` as text. Lengths are in the unit of the poses."""
 
     @classmethod
-    def open(cls, path: str | Path) -> "PairResults":
+    def open(cls, path: str | Path, whole: bool = True) -> "PairResults":
         """Open a pair's results, given any file of it: `poses/<pair>.txt`, `.csv` or `.h5`.
 
         If there is no table, because another tool computed the poses, every pose counts as `ok`.
+
+        Args:
+            whole: refuse files that differ from their record: in a truncated file, missing queries would look like
+                queries without a pose.
 
         Raises:
             ArtifactError: a file is missing or torn.
         """
         poses, csv = Path(path).with_suffix(".txt"), Path(path).with_suffix(".csv")
-        require_whole(poses)  # in a truncated file, missing queries would look like queries without a pose
-        require_whole(csv, of=poses)
+        if whole:
+            require_whole(poses)
+            require_whole(csv, of=poses)
         if csv.is_file() or not poses.is_file():
             return cls(poses, read_query_table(csv, ["status"]))
         try:
@@ -86,11 +91,6 @@ class PairResults:
     @property
     def h5(self) -> Path:
         return self.path.with_suffix(".h5")
-
-    @property
-    def status(self) -> pd.Series:
-        """Status of each query without its reason: `ok`, `low_confidence`, `failed`."""
-        return statuses(self.table["status"])
 
     @cached_property
     def trajectory(self) -> Trajectory:
