@@ -90,7 +90,9 @@ def retrieve_pairs(
         raise ManifestError(f"out_jsonl is one file ({out}) for {len(chosen)} pairs; give a folder.")
     folder = out.parent if out.suffix == ".jsonl" else out
     table = PairRows(capture.name, folder)
-    poses = None if settings.mask.poses is None else Trajectory.read(settings.mask.poses)
+    if (rough := settings.mask.poses) is not None and not Path(rough).is_file():
+        raise ManifestError(f"retrieve.mask.poses: found no file {rough}. Expected poses as in trajectories.txt.")
+    poses = None if rough is None else Trajectory.read(rough)
 
     @cache
     def load_queries(device: str) -> _Images:
