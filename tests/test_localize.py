@@ -252,10 +252,11 @@ def test_wrong_questions_are_refused(
 
 def test_a_pose_without_covariance_leaves_the_others_theirs(tmp_path: Path) -> None:
     covariances = np.eye(6), np.full((6, 6), np.nan)
-    rows = [({"timestamp": time, "device_id": "a"}, np.eye(4), covariances[time]) for time in (0, 1)]
-    pair = SimpleNamespace(file=lambda suffix: tmp_path / f"pair.{suffix}")
-    localize._write_poses(pair, rows, LocalizeSettings())  # type: ignore[arg-type]
-    np.testing.assert_array_equal(Trajectory.read(pair.file("txt")).covariances, [np.eye(6), np.full((6, 6), np.nan)])
+    row = {"device_id": "a", "world_from_rig": np.eye(4)}
+    rows = [row | {"timestamp": time, "covariance": covariances[time]} for time in (0, 1)]
+    localize._write_poses(tmp_path / "pair.txt", rows, LocalizeSettings())
+    written = Trajectory.read(tmp_path / "pair.txt").covariances
+    np.testing.assert_array_equal(written, [np.eye(6), np.full((6, 6), np.nan)])
 
 
 def test_a_map_of_an_older_format_is_built_anew(small_capture: Path, run: SceneFiles) -> None:
@@ -531,7 +532,7 @@ def test_a_network_is_asked_once_about_a_query_that_escalates(
     add_other_kind(monkeypatch)
     predictor, asked = ByContent(Capture.open(small_capture), run.maps), list[int]()
 
-    def predict(groups: Sequence[Sequence[View]]) -> list[Prediction]:
+    def predict(groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]]) -> list[Prediction]:
         asked.append(len(groups))
         return ByContent.predict(predictor, groups)
 
@@ -995,7 +996,7 @@ class ByContent:
             for row in session.camera_rows.tolist()
         }
 
-    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
         def named(view: View) -> View:
             pixels = read_image(view.image) if isinstance(view.image, Path) else view.image
             return replace(view, name=self.names[pixels.tobytes()])

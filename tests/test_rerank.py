@@ -17,7 +17,7 @@ from tests.rendered import copy_shared
 from toolkit import rerank
 from toolkit.capture import Capture, Trajectory
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError
-from toolkit.evaluate import overlap_in_view, overlap_table
+from toolkit.evaluate import overlap_table
 from toolkit.features import verification
 from toolkit.features.features import KINDS, LocalFeatures
 from toolkit.features.matching import LocalMethod, MutualMatcher
@@ -27,6 +27,7 @@ from toolkit.files import SceneFiles, read_references, sidecar_path
 from toolkit.geometry import invert, make_pose, transform
 from toolkit.manifest import RerankSettings
 from toolkit.rerank import rerank_pairs
+from toolkit.results.metrics import overlap_in_view
 from toolkit.retrieve import retrieve_pairs
 
 WIDE = pycolmap.Camera(model="PINHOLE", width=960, height=720, params=[700, 700, 480, 360])

@@ -1,10 +1,8 @@
 """The embed stage: global descriptors of all images of a capture, one matrix and one table per subsession."""
 
 import logging
-import os
-import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
@@ -19,7 +17,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
 from toolkit.capture.images import default_workers, prefetch, read_image
-from toolkit.capture.upright import Turns, turn_image, upright_turns
+from toolkit.capture.upright import turn_image, upright_turns
 from toolkit.embedders import WEIGHTS, Embedder, create_embedder, resolve_model, shows_upright
 from toolkit.errors import CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures
@@ -30,6 +28,7 @@ from toolkit.files import (
     files_fingerprint,
     fingerprint,
     is_current,
+    link_or_copy,
     read_json,
     sidecar_path,
     write_atomic,
@@ -105,109 +104,11 @@ def embed_sessions(
     for name in settings.models:
         # A run with several models reuses the files of a run with one of them alone, and vice versa.
         own, other = (out_dir / name, out_dir) if several else (out_dir, out_dir / name)
-        folders = _Folders(own, other, features_dir)
         model_settings = settings.model_copy(update={"model": name})
-        tables.append(_embed_with_model(capture, folders, model_settings, devices, subsession, skip_existing))
+        stage = _Model(capture, model_settings, devices, own, other, features_dir, skip_existing)
+        tables.append(stage.embed(subsession))
     write_text(out_dir / "settings.json", settings.model_dump_json(indent=1) + "\n")
     return pd.concat(tables, ignore_index=True) if several else tables[0]
-
-
-@dataclass(frozen=True)
-class _Folders:
-    """Folders of one model: its embeddings, and its inputs."""
-
-    out: Path
-    other: Path
-    """Folder where a run with another number of models puts the same embeddings."""
-    features: Path
-
-    def take_over(self, path: Path, record: dict[str, Any]) -> bool:
-        """Copy an artifact and the files of its record from the other folder; False if it is not current there."""
-        source = self.other / path.relative_to(self.out)
-        if not is_current(source, record):
-            return False
-        (path.parent / "failed.csv").unlink(missing_ok=True)
-        # Files are replaced, never changed, so both folders can share them by hard links.
-        for name in [*read_json(sidecar_path(source))["files"], sidecar_path(source).name]:
-            with write_atomic(path.with_name(name)) as temporary:
-                try:
-                    temporary.unlink()
-                    os.link(source.with_name(name), temporary)
-                except OSError:  # a file system without links
-                    shutil.copyfile(source.with_name(name), temporary)
-        return True
-
-
-def _embed_with_model(
-    capture: Capture,
-    folders: _Folders,
-    settings: EmbedSettings,
-    devices: list[str],
-    subsession: str,
-    skip_existing: bool,
-) -> pd.DataFrame:
-    out_dir, features_dir = folders.out, folders.features
-    parts, unreadable = _subsessions(capture, devices, subsession)
-    embedder = _open_embedder(capture, settings, folders, skip_existing)
-    if (turns := _turns(capture, embedder, settings)) is not None:
-        parts = [replace(part, turns=turns.of(part.session, part.rows)) for part in parts]
-    if subsession == "all":
-        names = [name for name in _session_names(capture, devices) if name not in unreadable]
-        _remove_former(out_dir, names, parts)
-
-    @cache
-    def store_of(session_id: str) -> FeatureStore:
-        """Return the features of all subsessions of a session, so that its file is written once."""
-        rows = [part.rows for part in parts if part.session.id == session_id]
-        return extract_session(capture[session_id], features_dir, rows=np.concatenate(rows))
-
-    table = []
-    for part in parts:
-        started = time.perf_counter()
-        folder = out_dir / part.session.id / part.name
-        matrix_path = folder / f"{Path(part.name).name}.npy"
-        record = {
-            "embedder": embedder.settings,
-            "features": SiftExtractor().settings if embedder.inputs == "features" else None,
-            "images": _images_fingerprint(part.session, part.rows),
-            "sensors": file_fingerprint(part.session.path / "sensors.txt"),
-            "turns": fingerprint(part.turns.tolist()) if part.turns.any() else None,
-            "normalize": settings.normalize,
-            "dtype": settings.dtype,
-        }
-        skipped = skip_existing and (is_current(matrix_path, record) or folders.take_over(matrix_path, record))
-        if skipped:
-            remove_items(matrix_path)
-            embedded = len(np.load(matrix_path, mmap_mode="r"))
-        else:
-            # Progress is kept per batch, so it depends on the batch size; the finished matrix does not, up to rounding.
-            source = fingerprint({**record, "rows_a_batch": settings.batch_size})
-            with Items(items_beside(matrix_path), again=not skip_existing) as batches:
-                failed = _embed(embedder, part, batches, source, settings, store_of)
-                embedded = len(part.rows) - len(failed)
-                tables = _write_tables(folder, capture.name, part, failed)
-                vectors = (batches[name][VECTORS] for name in _names(part, settings))
-                write_matrix(matrix_path, vectors, embedded, embedder.dim, settings.dtype)
-                write_sidecar(matrix_path, record, tables)
-            remove_items(matrix_path)
-        table.append(
-            {
-                "session": part.session.id,
-                "subsession": part.name,
-                "images": len(part.rows),
-                "embedded": embedded,
-                "unreadable": len(part.rows) - embedded,
-                "turned": int(np.count_nonzero(part.turns)),
-                "seconds": round(time.perf_counter() - started, 3),
-                "skipped": skipped,
-                "model": embedder.name,
-                "dim": embedder.dim,
-                "reason": "",
-            }
-        )
-    empty_row = {name: type(value)() for name, value in table[0].items()}
-    table += [{**empty_row, "session": name, "reason": reason} for name, reason in unreadable.items()]
-    return pd.DataFrame(table)
 
 
 @dataclass(frozen=True)
@@ -222,54 +123,178 @@ class _Subsession:
     """(N,) counter-clockwise quarter turns that make each image upright; 0 if the embedder takes them as stored."""
 
 
-def _open_embedder(capture: Capture, settings: EmbedSettings, folders: _Folders, skip_existing: bool) -> Embedder:
-    (name,) = settings.models
-    if name == "vlad":
-        return create_embedder(name, vocabulary=_vocabulary(capture, folders, settings, skip_existing))
-    return create_embedder(
-        name,
-        checkpoint=settings.checkpoint,
-        device=settings.compute_device,
-        dtype_compute=settings.dtype_compute,
-        image_size=settings.image_size,
-    )
+@dataclass(frozen=True)
+class _Model:
+    """The embeddings of a capture by one model."""
 
+    capture: Capture
+    settings: EmbedSettings
+    devices: list[str]
+    out: Path
+    other: Path
+    """Folder where a run with another number of models puts the same embeddings."""
+    features: Path
+    skip_existing: bool
 
-def _turns(capture: Capture, embedder: Embedder, settings: EmbedSettings) -> Turns | None:
-    """Return the turns that make images upright, or None if the embedder takes them as stored."""
-    return upright_turns(capture, settings.world_up) if shows_upright(embedder, settings.upright) else None
+    def embed(self, subsession: str) -> pd.DataFrame:
+        """Write the embeddings, and return a row per subsession; see `embed_sessions`."""
+        capture, settings, out = self.capture, self.settings, self.out
+        ids = [f"{key}_{split}" for key in self.devices for split in ("map", "query")]
+        ids = [id_ for id_ in ids if id_ in capture]
+        parts, unreadable = self._subsessions(ids, subsession)
+        embedder = self._open_embedder()
+        if shows_upright(embedder, settings.upright):
+            turns = upright_turns(capture, settings.world_up)
+            parts = [replace(part, turns=turns.of(part.session, part.rows)) for part in parts]
+        if subsession == "all":
+            _remove_former(out, [id_ for id_ in ids if id_ not in unreadable], parts)
 
+        @cache
+        def store_of(session_id: str) -> FeatureStore:
+            """Return the features of all subsessions of a session, so that its file is written once."""
+            rows = [part.rows for part in parts if part.session.id == session_id]
+            return extract_session(capture[session_id], self.features, rows=np.concatenate(rows))
 
-def _session_names(capture: Capture, devices: list[str]) -> list[str]:
-    names = [f"{key}_{split}" for key in devices for split in ("map", "query")]
-    return [name for name in names if name in capture]
+        table = []
+        for part in parts:
+            started = time.perf_counter()
+            folder = out / part.session.id / part.name
+            matrix_path = folder / f"{folder.name}.npy"
+            record = {
+                "embedder": embedder.settings,
+                "features": SiftExtractor().settings if embedder.inputs == "features" else None,
+                "images": _images_fingerprint(part.session, part.rows),
+                "sensors": file_fingerprint(part.session.path / "sensors.txt"),
+                "turns": fingerprint(part.turns.tolist()) if part.turns.any() else None,
+                "normalize": settings.normalize,
+                "dtype": settings.dtype,
+            }
+            skipped = self._is_current(matrix_path, record)
+            if skipped:
+                embedded = len(np.load(matrix_path, mmap_mode="r"))
+            else:
+                # Progress is kept per batch, so it depends on the batch size; the matrix does not, up to rounding.
+                source = fingerprint({**record, "rows_a_batch": settings.batch_size})
+                todo = [(f"{at:08d}", source, at) for at in range(-(-len(part.rows) // settings.batch_size))]
+                store = store_of(part.session.id) if embedder.inputs == "features" else None
+                arguments = embedder, part, settings, store
+                with Items(items_beside(matrix_path), again=not self.skip_existing) as batches:
+                    left = batches.spread(_embed_into, batches.left(todo), arguments, _label(part), "batch")
+                    _embed_into(batches, left, *arguments)
+                    batches.flush()
+                    failed = {row: reason for name, *_ in todo for row, reason in batches.note(name)["failed"]}
+                    embedded = len(part.rows) - len(failed)
+                    tables = _write_tables(folder, capture.name, part, failed)
+                    vectors = (batches[name][VECTORS] for name, *_ in todo)
+                    write_matrix(matrix_path, vectors, embedded, embedder.dim, settings.dtype)
+                    write_sidecar(matrix_path, record, tables)
+            remove_items(matrix_path)
+            table.append(
+                {
+                    "session": part.session.id,
+                    "subsession": part.name,
+                    "images": len(part.rows),
+                    "embedded": embedded,
+                    "unreadable": len(part.rows) - embedded,
+                    "turned": int(np.count_nonzero(part.turns)),
+                    "seconds": round(time.perf_counter() - started, 3),
+                    "skipped": skipped,
+                    "model": embedder.name,
+                    "dim": embedder.dim,
+                    "reason": "",
+                }
+            )
+        empty_row = {name: type(value)() for name, value in table[0].items()}
+        table += [{**empty_row, "session": id_, "reason": str(error)} for id_, error in unreadable.items()]
+        return pd.DataFrame(table)
 
+    def _is_current(self, path: Path, record: dict[str, Any]) -> bool:
+        """Tell whether to reuse an artifact, which is linked from the other folder if it is current only there."""
+        if not self.skip_existing:
+            return False
+        source = self.other / path.relative_to(self.out)
+        if not is_current(path, record) and is_current(source, record):
+            (path.parent / "failed.csv").unlink(missing_ok=True)
+            for name in [*read_json(sidecar_path(source))["files"], sidecar_path(source).name]:
+                with write_atomic(path.with_name(name)) as temporary:
+                    temporary.unlink()
+                    link_or_copy(source.with_name(name), temporary)
+        return is_current(path, record)
 
-def _subsessions(capture: Capture, devices: list[str], subsession: str) -> tuple[list[_Subsession], dict[str, str]]:
-    """Return the subsessions to embed, without turns, and for each unreadable session the reason."""
-    names = _session_names(capture, devices)
-    parts, unreadable = list[_Subsession](), dict[str, CaptureError]()
-    for id_ in names:
-        try:
-            session = capture[id_]
-            rows = session.camera_rows
-        except CaptureError as error:
-            log.warning("%s is left out: %s", id_, error)
-            unreadable[id_] = error
-            continue
-        subsessions = session.subsession_of(rows)
-        # Images outside all listed subsessions are embedded too, under the session's name.
-        subsessions = np.where(subsessions == "", session.id, subsessions)
-        for name in dict.fromkeys(subsessions.tolist()):
-            members = rows[subsessions == name]
-            parts.append(_Subsession(session, name, members, np.zeros(len(members), np.int64)))
-    selected = [part for part in parts if subsession in ("all", part.name)]
-    if not parts and unreadable:
-        raise next(iter(unreadable.values()))
-    if not selected:
-        known = ", ".join(part.name for part in parts)
-        raise ManifestError(f"No images of subsession {subsession!r} in {', '.join(names)}; known: {known}.")
-    return selected, {id_: str(error) for id_, error in unreadable.items()}
+    def _subsessions(self, ids: list[str], subsession: str) -> tuple[list[_Subsession], dict[str, CaptureError]]:
+        """Return the subsessions to embed, without turns, and the error of each unreadable session."""
+        parts, unreadable = list[_Subsession](), dict[str, CaptureError]()
+        for id_ in ids:
+            try:
+                session = self.capture[id_]
+                rows = session.camera_rows
+            except CaptureError as error:
+                log.warning("%s is left out: %s", id_, error)
+                unreadable[id_] = error
+                continue
+            # Images outside all listed subsessions are embedded too, under the session's name.
+            names = np.where((names := session.subsession_of(rows)) == "", session.id, names)
+            for name in dict.fromkeys(names.tolist()):
+                members = rows[names == name]
+                parts.append(_Subsession(session, name, members, np.zeros(len(members), np.int64)))
+        selected = [part for part in parts if subsession in ("all", part.name)]
+        if not parts and unreadable:
+            raise next(iter(unreadable.values()))
+        if not selected:
+            known = ", ".join(part.name for part in parts)
+            raise ManifestError(f"No images of subsession {subsession!r} in {', '.join(ids)}; known: {known}.")
+        return selected, unreadable
+
+    def _open_embedder(self) -> Embedder:
+        (name,), settings = self.settings.models, self.settings
+        if name == "vlad":
+            return create_embedder(name, vocabulary=self._vocabulary())
+        return create_embedder(
+            name,
+            checkpoint=settings.checkpoint,
+            device=settings.compute_device,
+            dtype_compute=settings.dtype_compute,
+            image_size=settings.image_size,
+        )
+
+    def _vocabulary(self) -> Path:
+        """Learn the VLAD vocabulary from the map images of all devices, unless the file is current."""
+        from toolkit.embedders.vlad import VLAD_FORMAT, Vlad
+
+        capture = self.capture
+        images = [(session, int(row)) for session in capture.usable("map") for row in session.camera_rows]
+        if not images:
+            raise ToolkitError(
+                f"{capture.path}/sessions has no <device>_map session that can be read; `vlad` learns its vocabulary "
+                "from the map."
+            )
+        chosen: dict[str, list[int]] = {}
+        for index in np.linspace(0, len(images) - 1, min(len(images), VOCABULARY_IMAGES)).astype(int).tolist():
+            session, row = images[index]
+            chosen.setdefault(session.id, []).append(row)
+        record = {
+            "features": SiftExtractor().settings,
+            "images": {name: _images_fingerprint(capture[name], np.array(rows)) for name, rows in chosen.items()},
+            "seed": self.settings.seed,
+            "format": VLAD_FORMAT,
+        }
+        path = self.out / "vlad.npz"
+        if self._is_current(path, record):
+            return path
+        stores = {
+            name: extract_session(capture[name], self.features, rows=np.array(rows)) for name, rows in chosen.items()
+        }
+        keys = [(name, capture[name].image_name(row)) for name, rows in chosen.items() for row in rows]
+        keys = [(name, image) for name, image in keys if image in stores[name]]
+
+        def features() -> Iterator[LocalFeatures]:
+            for name, image in tqdm(keys, desc="vocabulary", unit="image"):
+                yield stores[name][image]
+
+        vlad = Vlad.learn(features, len(keys), self.settings.seed)
+        vlad.save(path)
+        write_sidecar(path, record)
+        return path
 
 
 def _remove_former(out_dir: Path, names: list[str], parts: list[_Subsession]) -> None:
@@ -284,66 +309,8 @@ def _remove_former(out_dir: Path, names: list[str], parts: list[_Subsession]) ->
                     path.unlink(missing_ok=True)
 
 
-def _vocabulary(capture: Capture, folders: _Folders, settings: EmbedSettings, skip_existing: bool) -> Path:
-    """Learn the VLAD vocabulary from the map images of all devices, unless the file is current."""
-    from toolkit.embedders.vlad import VLAD_FORMAT, Vlad
-
-    maps = capture.usable("map")
-    if not maps:
-        raise ToolkitError(
-            f"{capture.path}/sessions has no <device>_map session that can be read; `vlad` learns its vocabulary from "
-            "the map."
-        )
-    images = [(session.id, int(row)) for session in maps for row in session.camera_rows]
-    rows_by_session: dict[str, list[int]] = {}
-    for index in np.linspace(0, len(images) - 1, min(len(images), VOCABULARY_IMAGES)).astype(int).tolist():
-        name, row = images[index]
-        rows_by_session.setdefault(name, []).append(row)
-    chosen = {name: np.array(rows) for name, rows in rows_by_session.items()}
-    record = {
-        "features": SiftExtractor().settings,
-        "images": {name: _images_fingerprint(capture[name], rows) for name, rows in chosen.items()},
-        "seed": settings.seed,
-        "format": VLAD_FORMAT,
-    }
-    path, features_dir = folders.out / "vlad.npz", folders.features
-    if skip_existing and (is_current(path, record) or folders.take_over(path, record)):
-        return path
-    stores = {name: extract_session(capture[name], features_dir, rows=rows) for name, rows in chosen.items()}
-    keys = [(name, capture[name].image_name(row)) for name, rows in rows_by_session.items() for row in rows]
-    keys = [(name, image) for name, image in keys if image in stores[name]]
-
-    def features() -> Iterator[LocalFeatures]:
-        for name, image in tqdm(keys, desc="vocabulary", unit="image"):
-            yield stores[name][image]
-
-    vlad = Vlad.learn(features, len(keys), settings.seed)
-    vlad.save(path)
-    write_sidecar(path, record)
-    return path
-
-
-def _embed(
-    embedder: Embedder,
-    part: _Subsession,
-    batches: Items,
-    source: str,
-    settings: EmbedSettings,
-    store_of: Callable[[str], FeatureStore],
-) -> dict[int, str]:
-    """Add the vectors of the readable images, in order; return the reason for each unreadable one, by row."""
-    store = store_of(part.session.id) if embedder.inputs == "features" else None
-    names, label = _names(part, settings), f"embed {part.session.id}/{part.name}"
-    todo = batches.left((name, source, number) for number, name in enumerate(names))
-    arguments = embedder, part, settings, store, label
-    _embed_into(batches, batches.spread(_embed_into, todo, arguments, label, "batch"), *arguments)
-    batches.flush()
-    return {row: reason for name in names for row, reason in batches.note(name)["failed"]}
-
-
-def _names(part: _Subsession, settings: EmbedSettings) -> list[str]:
-    """Return the names of the batches of a subsession, in order."""
-    return [f"{number:08d}" for number in range(-(-len(part.rows) // settings.batch_size))]
+def _label(part: _Subsession) -> str:
+    return f"embed {part.session.id}/{part.name}"
 
 
 def _embed_into(
@@ -353,23 +320,35 @@ def _embed_into(
     part: _Subsession,
     settings: EmbedSettings,
     store: FeatureStore | None,
-    label: str,
 ) -> None:
     """Embed the batches `todo` (name, source, number); store their vectors and the reasons for unreadable images."""
-    size = settings.batch_size
-    slices = [slice(number * size, (number + 1) * size) for *_, number in todo]
-    left = np.concatenate([np.zeros(0, np.int64), *(np.arange(len(part.rows))[rows] for rows in slices)])
-    inputs = _inputs(embedder, replace(part, rows=part.rows[left], turns=part.turns[left]), size, store)
+    size, session = settings.batch_size, part.session
+    rows = [np.arange(len(part.rows))[number * size : (number + 1) * size] for *_, number in todo]
+    left = np.concatenate([np.zeros(0, np.int64), *rows])
+
+    def read(at: int) -> tuple[int, Any | str]:
+        """Return the row and the input (features or a prepared image) of an image; a str is why it has none."""
+        row = int(part.rows[at])
+        if store is not None:
+            name = session.image_name(row)
+            if name not in store:
+                return row, store.failed.get(name, "no local features were extracted")
+            return row, embedder.prepare(store[name])
+        try:
+            image = read_image(session.image_path(row), least_side=embedder.least_side)
+        except ImageError as error:
+            return row, str(error)
+        return row, embedder.prepare(turn_image(image, int(part.turns[at])))
 
     def stack(items: list[tuple[int, Any | str]]) -> tuple[Any, dict[int, str]]:
         readable = [item for _, item in items if not isinstance(item, str)]
         unreadable = {row: item for row, item in items if isinstance(item, str)}
         return embedder.stack(readable) if readable else readable, unreadable
 
+    inputs = iter(prefetch(read, left.tolist(), workers=default_workers(), ahead=2 * size))
     # Copy the next batch to the device while one is embedded.
-    inputs_of_batches = (list(islice(inputs, len(part.rows[rows]))) for rows in slices)
-    stacked = prefetch(stack, inputs_of_batches, workers=1, ahead=0)
-    bar = tqdm(total=len(part.rows), initial=len(part.rows) - len(left), desc=label, unit="image")
+    stacked = prefetch(stack, (list(islice(inputs, len(each))) for each in rows), workers=1, ahead=0)
+    bar = tqdm(total=len(part.rows), initial=len(part.rows) - len(left), desc=_label(part), unit="image")
     # Features are described in a thread a core; a network has its own threads.
     with bar, one_thread() if store is not None else nullcontext():
         for (name, source, _), (batch, unreadable) in zip(todo, stacked, strict=True):
@@ -389,29 +368,6 @@ def write_matrix(path: Path, batches: Iterable[NDArray[np.floating]], rows: int,
         np.lib.format.write_array_header_1_0(stream, header)
         for vectors in batches:
             stream.write(np.ascontiguousarray(vectors, dtype).tobytes())
-
-
-def _inputs(
-    embedder: Embedder, part: _Subsession, batch_size: int, store: FeatureStore | None
-) -> Iterator[tuple[int, Any | str]]:
-    """Yield the row and the input (features or a prepared image) of each image; a str is why it has none."""
-    session = part.session
-
-    def read(item: tuple[int, int]) -> tuple[int, Any | str]:
-        row, turns = item
-        if store is not None:
-            name = session.image_name(row)
-            if name not in store:
-                return row, store.failed.get(name, "no local features were extracted")
-            return row, embedder.prepare(store[name])
-        try:
-            image = read_image(session.image_path(row), least_side=embedder.least_side)
-        except ImageError as error:
-            return row, str(error)
-        return row, embedder.prepare(turn_image(image, turns))
-
-    items = zip(part.rows.tolist(), part.turns.tolist(), strict=True)
-    yield from prefetch(read, items, workers=default_workers(), ahead=2 * batch_size)
 
 
 def _images_fingerprint(session: Session, rows: NDArray[np.intp]) -> str:

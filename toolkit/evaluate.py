@@ -31,25 +31,9 @@ from toolkit.files import (
 from toolkit.geometry import Floats
 from toolkit.manifest import EvaluateSettings
 from toolkit.pose.result import Status, status_counts, statuses
-from toolkit.results.metrics import (
-    NO_POSE,
-    NO_REFERENCE,
-    REASONS,
-    WRONG,
-    WRONG_POSE,
-    Threshold,
-    camera_messages,
-    is_below,
-    is_posed,
-    length_unit,
-    named_by_unit,
-    pose_errors,
-    poses_of,
-    recall,
-    threshold_name,
-    unit_of,
-)
-from toolkit.results.overlap import LEAST_OVERLAP, overlap_in_view, seen_by
+from toolkit.results import metrics
+from toolkit.results.metrics import is_posed, pose_errors
+from toolkit.results.metrics import recall as recall  # for callers
 from toolkit.results.pair import PairResults, load_maps, map_files
 from toolkit.runs.pairs import LEFT_OUT, left_out
 
@@ -58,7 +42,9 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-
+TABLES = {"recall": "recall", "errors": "errors", "retrieval": "retrieval", "losses": "losses", "overlap": "overlap",
+          "sequence": "sequences", "changes": "changes"}  # fmt: skip
+"""Names of the tables, `<name>.csv`, and attributes of an evaluation."""
 FIGURES = ("recall", "median_errors", "error_curves", "losses", "reliability", "deviations", "retrieval", "sequence")
 ERROR_COLUMNS = ["map_device", "query_device", "timestamp", "device_id", "image", "status", "num_inliers",
                  "p_correct", "position_std_m", "rotation_error_deg", "translation_error_m"]  # fmt: skip
@@ -71,7 +57,7 @@ RETRIEVAL_RADIUS_M = 8.0
 16 m."""
 RETRIEVAL_ANGLE_DEG = 45.0
 """Largest angle between the viewing directions of a correct reference and the query, degrees; roll is ignored."""
-_PAIR = ["map_device", "query_device"]
+_PAIR, _KEY = ["map_device", "query_device"], ["timestamp", "device_id"]
 
 
 def evaluate_scene(
@@ -118,28 +104,25 @@ def evaluate_scene(
     settings = EvaluateSettings.of(settings)
     limits = tuple((float(degrees), float(meters)) for degrees, meters in settings.thresholds)
     capture = Capture.from_sessions_root(sessions_root)
-    map_devices = capture.devices_with("map", map_device)
+    devices = capture.devices_with("map", map_device), capture.devices_with("query", query_device)
     rows: dict[str, list[dict[str, Any]]] = {"recall": [], "retrieval": [], "losses": []}
-    errors: list[pd.DataFrame] = []
-    messages: list[str] = []
+    errors, messages, sources = list[pd.DataFrame](), list[str](), list[Path]()
     references_dir = retrieval_dir and (reranked_dir or retrieval_dir)
-    sources: list[Path] = []
-    for query in capture.devices_with("query", query_device):
-        maps = [map_ for map_ in map_devices if pairs is None or [map_, query] in map(list, pairs)]
+    for query in devices[1]:
+        maps = [map_ for map_, _ in _chosen((devices[0], [query]), pairs)]
         if not maps:
             continue
         reason = ""
         try:
             session = capture[f"{query}_query"]
             keys, truth = _queries_with_truth(session, queries, messages)
-            messages += camera_messages(session, _query_tables(poses_dir, capture.name, maps, query))
+            tables = (_table_of(poses_dir, capture.name, map_, query) for map_ in maps)
+            messages += metrics.camera_messages(session, [table for table in tables if table is not None])
         except CaptureError as error:
             reason = str(error)
         for map_ in maps:
-            pair = {"map_device": map_, "query_device": query}
-            record = read_map_record(map_record_path(poses_dir, capture.name, map_))
-            unit, length = length_unit(record)
-            name = pair_name(capture.name, map_, query)
+            pair, name = {"map_device": map_, "query_device": query}, pair_name(capture.name, map_, query)
+            poses = Path(poses_dir) / f"{name}.txt"
             if cause := reason or left_out(poses_dir, name) or _unreadable(capture, f"{map_}_map"):
                 messages.append(f"{name} was left out: {cause}")
                 for kind in ("recall", "losses"):
@@ -147,26 +130,26 @@ def evaluate_scene(
                 continue
             if not len(keys):
                 no_queries = truth is not None and session.keyframes(queries).empty
-                for table in rows.values():
-                    table.append({**pair, "state": "no queries" if no_queries else "no ground truth"})
+                for kind in rows:
+                    rows[kind].append({**pair, "state": "no queries" if no_queries else "no ground truth"})
                 continue
-            good = None
-            read = [Path(poses_dir) / f"{name}{end}" for end in (".txt", ".csv", "_sequence.txt")]
+            record = read_map_record(map_record_path(poses_dir, capture.name, map_))
+            unit, length = metrics.length_unit(record)
+            read = [poses, poses.with_suffix(".csv"), poses.with_name(f"{name}_sequence.txt")]
             read += [Path(folder) / f"{name}.jsonl" for folder in (retrieval_dir, reranked_dir) if folder is not None]
             sources += filter(Path.is_file, read)
-            older = why_older(Path(poses_dir) / f"{name}.txt", "localize", (".jsonl",), missing=False)
-            if older:
+            good = None
+            if older := why_older(poses, "localize", (".jsonl",), missing=False):
                 messages.append(f"{older} Retrieval is not judged.")
                 rows["retrieval"].append({**pair, "state": f"{LEFT_OUT}{older}"})
             elif references_dir is not None:
+                lengths = length, record["length"] or length
                 path = Path(references_dir) / f"{name}.jsonl"
-                row, good = _retrieval_recall(
-                    path, keys, truth, capture[f"{map_}_map"], length, record["length"] or length
-                )
+                row, good = _retrieval_recall(path, keys, truth, capture[f"{map_}_map"], *lengths)
                 rows["retrieval"].append({**pair, **row})
                 if good is None:
                     messages.append(f"{name}: {row['state']}, so no miss is attributed to retrieval.")
-            results, state = _read_results(Path(poses_dir) / f"{name}.txt", keys)
+            results, state = _read_results(poses, keys)
             if results is None:
                 messages.append(f"{name}: {state}; its queries are not counted.")
                 for kind in ("recall", "losses"):
@@ -184,22 +167,17 @@ def evaluate_scene(
     if all(row["state"].startswith(LEFT_OUT) for row in rows["recall"]):
         raise CaptureError(messages[0])
     folders = {"retrieved": retrieval_dir, "reranked": reranked_dir}
+    references = {name: folder for name, folder in folders.items() if folder is not None}
     evaluation = Evaluation(
         _table(pd.DataFrame(rows["recall"]), "queries"),
         _table(pd.concat(errors)) if errors else pd.DataFrame(columns=ERROR_COLUMNS),
         _table(pd.DataFrame(rows["retrieval"])),
-        _table(pd.DataFrame(rows["losses"]), "threshold", *REASONS, "queries", "missed"),
-        overlap_table(
-            sessions_root,
-            {name: folder for name, folder in folders.items() if folder is not None},
-            *(map_dir, map_device, query_device, pairs, poses_dir),
-        ),
+        _table(pd.DataFrame(rows["losses"]), "threshold", *metrics.REASONS, "queries", "missed"),
+        overlap_table(sessions_root, references, map_dir, map_device, query_device, pairs, poses_dir),
         limits,
         list(dict.fromkeys(messages)),
-        unit_of(*(name for row in rows["recall"] for name in row)),
-        *evaluate_sequences(
-            *(capture, poses_dir, limits, map_devices, capture.devices_with("query", query_device), queries, pairs)
-        ),
+        metrics.unit_of(*(name for row in rows["recall"] for name in row)),
+        *evaluate_sequences(capture, poses_dir, limits, *devices, queries, pairs),
     )
     for message in evaluation.messages:
         logger.warning(message)
@@ -209,10 +187,17 @@ def evaluate_scene(
     return evaluation
 
 
+def _chosen(
+    devices: tuple[Sequence[str], Sequence[str]], pairs: Sequence[Sequence[str]] | None
+) -> list[tuple[str, str]]:
+    """Return the pairs of map devices and query devices that are among `pairs`; None: all."""
+    return [pair for pair in product(*devices) if pairs is None or list(pair) in map(list, pairs)]
+
+
 def evaluate_sequences(
     capture: Capture,
     poses_dir: str | Path,
-    limits: Sequence[Threshold],
+    limits: Sequence[metrics.Threshold],
     map_devices: Sequence[str],
     query_devices: Sequence[str],
     queries: str = "keyframes_pruned_subsampled",
@@ -229,15 +214,15 @@ def evaluate_sequences(
         sequence stage rescued or broke, see `SequencePair.changes`. Both are empty without sequences or ground truth.
     """
     steps, changes = [pd.DataFrame()], [pd.DataFrame()]
-    for map_, query in product(map_devices, query_devices):
+    for map_, query in _chosen((map_devices, query_devices), pairs):
         sequence = SequencePair.find(poses_dir, capture.name, map_, query)
-        if sequence is None or not (pairs is None or [map_, query] in map(list, pairs)):
+        if sequence is None:
             continue
         try:
             keys, truth = _queries_with_truth(capture[f"{query}_query"], queries, [])
             if truth is None or not len(keys):
                 continue
-            unit, length = length_unit(read_map_record(map_record_path(poses_dir, capture.name, map_)))
+            unit, length = metrics.length_unit(read_map_record(map_record_path(poses_dir, capture.name, map_)))
             pair = {"map_device": map_, "query_device": query}
             steps.append(pd.DataFrame(sequence.recalls(keys, truth, limits, unit, length)).assign(**pair))
             changes.append(sequence.changes(keys, truth, limits[-1], length).assign(**pair))
@@ -262,24 +247,23 @@ def write_evaluation(
 ) -> None:
     """Write the tables as CSV, the figures as PNG, and settings and `sources` to the sidecar of recall.csv."""
     out = Path(out_dir)
-    written = [out / f"{name}.csv" for name in ("recall", "errors", "retrieval", "losses", "overlap")]
-    tables = {path: getattr(evaluation, path.stem) for path in written}
-    for path, table in ((out / "sequence.csv", evaluation.sequences), (out / "changes.csv", evaluation.changes)):
-        if len(evaluation.sequences):
-            tables[path] = table
-            written.append(path)
-        else:  # remove a table of an earlier run with sequences
+    tables: dict[str, Any] = {name: getattr(evaluation, attribute) for name, attribute in TABLES.items()}
+    if not len(evaluation.sequences):
+        tables |= {"sequence": None, "changes": None}
+    figures, written = draw_evaluation(evaluation), list[Path]()
+    for path, content in {
+        **{out / f"{name}.csv": table for name, table in tables.items()},
+        **{out / f"{name}.png": figures.get(name) for name in FIGURES},
+    }.items():
+        if content is None:  # a file of an earlier evaluation would mislead
             path.unlink(missing_ok=True)
-    for path, table in tables.items():
-        with write_atomic(path) as temporary:
-            named_by_unit(table, evaluation.unit).to_csv(temporary, index=False)
-    figures = draw_evaluation(evaluation)
-    for name in FIGURES:
-        if name in figures:
-            save_figure(figures[name], out / f"{name}.png")
-            written.append(out / f"{name}.png")
-        else:  # a figure of an earlier evaluation would mislead
-            (out / f"{name}.png").unlink(missing_ok=True)
+            continue
+        written.append(path)
+        if isinstance(content, pd.DataFrame):
+            with write_atomic(path) as temporary:
+                metrics.named_by_unit(content, evaluation.unit).to_csv(temporary, index=False)
+        else:
+            save_figure(content, path)
     write_sidecar(out / "recall.csv", settings, written[1:], made_from=sources)
     logger.info("Evaluated %d of %d pairs: %s", (evaluation.recall["state"] == "evaluated").sum(),
                 len(evaluation.recall), out / "recall.csv")  # fmt: skip
@@ -291,20 +275,18 @@ def _queries_with_truth(session: Session, queries: str, messages: list[str]) -> 
         messages.append(f"{session.id} has no ground truth; it is not evaluated.")
         return pd.DataFrame({"timestamp": [], "device_id": []}), None
     keys = session.keyframes(queries).reset_index(drop=True)
-    has_truth = is_posed(poses_of(truth, keys))
+    has_truth = is_posed(metrics.poses_of(truth, keys))
     if not np.all(has_truth):
         missing = np.sum(~has_truth)
         messages.append(f"{session.id}: {missing} of {len(keys)} queries have no ground truth and are left out.")
     return keys[has_truth].reset_index(drop=True), truth
 
 
-def _query_tables(poses_dir: str | Path, scene: str, map_devices: Sequence[str], query: str) -> list[pd.DataFrame]:
-    """Return the readable tables of a query device's pairs."""
-    tables = []
-    for map_ in map_devices:
-        with suppress(ArtifactError):  # `_read_results` reports it
-            tables.append(PairResults.of(poses_dir, scene, map_, query).table)
-    return tables
+def _table_of(poses_dir: str | Path, scene: str, map_device: str, query_device: str) -> pd.DataFrame | None:
+    """Return the table of a pair; None if it cannot be read, which `_read_results` reports."""
+    with suppress(ArtifactError):
+        return PairResults.of(poses_dir, scene, map_device, query_device).table
+    return None
 
 
 def _read_results(path: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, str]:
@@ -313,27 +295,22 @@ def _read_results(path: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
         return None, "no poses file"
     try:
         require_whole(path)
-        poses = poses_of(Trajectory.read(path), keys)
+        poses = metrics.poses_of(Trajectory.read(path), keys)
     except ArtifactError as error:
         return None, str(error)
     except CaptureError as error:
         return None, f"unreadable poses file ({error})"
-    located = is_posed(poses)
+    located, table = is_posed(poses), path.with_suffix(".csv")
     status = np.where(located, Status.OK, Status.FAILED).astype(object)
     results = keys.assign(pose=list(poses), status=status, **dict.fromkeys(DETAILS, np.nan))
-    table = path.with_suffix(".csv")
-    columns = ["timestamp", "device_id"]
     try:
         require_whole(table, of=path)
         if not table.is_file():  # another tool writes only poses; then every pose counts as ok
             return results, "evaluated"
-        details = PairResults.open(path).table.drop_duplicates(columns)
+        details = keys.merge(PairResults.open(path).table.drop_duplicates(_KEY), how="left", on=_KEY)
     except ArtifactError as error:
         return results, f"unreadable table of queries ({error})"
-    details = keys.merge(details, how="left", on=columns)
-    for name in DETAILS:
-        if name in details:
-            results[name] = details[name].astype(float)
+    results = results.assign(**{name: details[name].astype(float) for name in DETAILS if name in details})
     results["status"] = details["status"].fillna(results["status"])
     num_rows = int(details["status"].notna().sum())
     if num_rows < len(keys):
@@ -349,7 +326,7 @@ def _errors_of(
     truth: Trajectory | None,
     session: Session,
     good: NDArray[np.bool_] | None,
-    thresholds: Sequence[Threshold],
+    thresholds: Sequence[metrics.Threshold],
     at: str,
     unit: str,
     length: float,
@@ -360,7 +337,7 @@ def _errors_of(
         good: whether each query has a good reference; None if unknown.
         length: the unit of lengths in the table, in the unit of the poses.
     """
-    estimated, true = np.stack(results["pose"].to_list()), poses_of(truth, keys)  # type: ignore[arg-type]
+    estimated, true = np.stack(results["pose"].to_list()), metrics.poses_of(truth, keys)  # type: ignore[arg-type]
     frame = results.drop(columns="pose")
     rows = session.rows_of_keyframes(keys)
     frame.insert(2, "image", session.own_names(rows))
@@ -379,35 +356,33 @@ def _errors_of(
         frame["position_std_m"] /= length
     frame["rotation_error_deg"], frame["translation_error_m"] = rotation_deg, translation_m
     no_reference = np.zeros(len(frame), bool) if good is None else ~frame["good_reference"].to_numpy(bool)
-    reason = np.select([no_reference, ~np.isfinite(rotation_deg)], [NO_REFERENCE, NO_POSE], WRONG_POSE)
+    why_not, wrong = [metrics.NO_REFERENCE, metrics.NO_POSE], metrics.WRONG_POSE
+    reason = np.select([no_reference, ~np.isfinite(rotation_deg)], why_not, wrong)
     for threshold in thresholds:
-        hit = is_below(rotation_deg, translation_m, threshold)
-        frame[f"loss@{threshold_name(threshold, unit)}"] = np.where(hit, "", reason)
+        hit = metrics.is_below(rotation_deg, translation_m, threshold)
+        frame[f"loss@{metrics.threshold_name(threshold, unit)}"] = np.where(hit, "", reason)
     return frame
 
 
-def _summary(frame: pd.DataFrame, thresholds: Sequence[Threshold], unit: str) -> dict[str, Any]:
+def _summary(frame: pd.DataFrame, thresholds: Sequence[metrics.Threshold], unit: str) -> dict[str, Any]:
     """Return a pair's row of the table `recall`."""
     rotation_deg, translation_m = (frame[name].to_numpy(float) for name in ERROR_COLUMNS[-2:])
     status = statuses(frame["status"])
-    shares = recall(rotation_deg, translation_m, thresholds)
-    wrong = (status == Status.OK) & ~is_below(rotation_deg, translation_m, WRONG)
+    wrong = (status == Status.OK) & ~metrics.is_below(rotation_deg, translation_m, metrics.WRONG)
     return {
         "queries": len(frame),
         "localized": int(np.isfinite(rotation_deg).sum()),
         **status_counts(frame["status"]),
-        **{f"recall@{threshold_name(t, unit)}": share for t, share in zip(thresholds, shares, strict=True)},
-        "median_rotation_deg": float(np.median(rotation_deg)),
-        "median_translation_m": float(np.median(translation_m)),
+        **metrics.summary_of(rotation_deg, translation_m, thresholds, unit),
         "ok_wrong": float(np.mean(wrong)),
     }
 
 
-def _losses(frame: pd.DataFrame, thresholds: Sequence[Threshold], unit: str) -> list[dict[str, Any]]:
+def _losses(frame: pd.DataFrame, thresholds: Sequence[metrics.Threshold], unit: str) -> list[dict[str, Any]]:
     """Return a pair's rows of the table `losses`, one per threshold."""
     rows = []
-    for name in (threshold_name(threshold, unit) for threshold in thresholds):
-        reasons = {reason: int((frame[f"loss@{name}"] == reason).sum()) for reason in REASONS}
+    for name in (metrics.threshold_name(threshold, unit) for threshold in thresholds):
+        reasons = {reason: int((frame[f"loss@{name}"] == reason).sum()) for reason in metrics.REASONS}
         rows.append({"threshold": name, "queries": len(frame), "missed": sum(reasons.values()), **reasons})
     return rows
 
@@ -442,8 +417,8 @@ def _retrieval_recall(
         return {"state": "no retrieval file", "queries": len(keys)}, None
     try:
         lines = read_references(path, "device_id", "Trs")
-        times = np.array([int(x["timestamp"]) for x in lines], np.int64)
-        index = pd.DataFrame({"timestamp": times, "device_id": [str(x["device_id"]) for x in lines]})
+        index = pd.DataFrame([(int(x["timestamp"]), str(x["device_id"])) for x in lines], columns=_KEY)
+        index = index.astype({"timestamp": np.int64})
         device_from_cam = np.array([x["Trs"] for x in lines], float).reshape(-1, 4, 4)
         references = np.full((len(lines), max([1, *(len(x["topk"]) for x in lines)]), 4, 4), np.nan)
         for i, line in enumerate(lines):
@@ -452,13 +427,13 @@ def _retrieval_recall(
     except (ArtifactError, ValueError, KeyError, TypeError) as error:
         state = f"unreadable retrieval file ({type(error).__name__}: {error})"
         return {"state": state, "queries": len(keys)}, None
-    cameras = poses_of(truth, index) @ device_from_cam  # type: ignore[arg-type]
+    cameras = metrics.poses_of(truth, index) @ device_from_cam  # type: ignore[arg-type]
     reach = RETRIEVAL_RADIUS_M * map_length, RETRIEVAL_ANGLE_DEG
     near = _is_near(references, cameras[:, None], reach)
     best = np.where(near.any(1), near.argmax(1), np.inf)
     in_map = _near_any(cameras, map_session.world_from_cam(), reach)
     # A query device has a good reference if any of its cameras has one.
-    frame = index.assign(rank=best, in_map=in_map).groupby(["timestamp", "device_id"], as_index=False)
+    frame = index.assign(rank=best, in_map=in_map).groupby(_KEY, as_index=False)
     by_device = keys.merge(frame.agg(rank=("rank", "min"), in_map=("in_map", "any")), how="left")
     rank = by_device["rank"].fillna(np.inf).to_numpy(float)
     row: dict[str, Any] = {"state": "evaluated", "queries": len(keys), "angle_deg": RETRIEVAL_ANGLE_DEG}
@@ -502,7 +477,7 @@ def overlap_table(
 ) -> pd.DataFrame:
     """Return for each pair the share of query images that overlap with their first reference, judged by true poses.
 
-    A reference overlaps with a query image if at least `LEAST_OVERLAP` of the triangulated map points that it observes
+    A reference overlaps with a query image if at least `MIN_OVERLAP` of the triangulated map points that it observes
     lie in the image's view (`overlap_in_view`). Without a triangulated map, points at 2, 4, 8 and 16 m in the
     reference's view replace the map points.
 
@@ -515,30 +490,25 @@ def overlap_table(
         One row per pair: map_device, query_device, state, images (with references and a true pose), points (`map` or
         `view`), and for each name `<name>` (share) and `<name>_mean` (mean overlap).
     """
-    capture = Capture.from_sessions_root(sessions_root)
-    load = lru_cache(maxsize=1)(load_maps)
-    rows = []
-    for map_, query in product(capture.devices_with("map", map_device), capture.devices_with("query", query_device)):
-        if not references or not (pairs is None or [map_, query] in map(list, pairs)):
-            continue
+    capture, load, rows = Capture.from_sessions_root(sessions_root), lru_cache(maxsize=1)(load_maps), []
+    devices = capture.devices_with("map", map_device), capture.devices_with("query", query_device)
+    for map_, query in _chosen(devices, pairs) if references else ():
         name = pair_name(capture.name, map_, query)
         h5 = None if poses_dir is None else Path(poses_dir) / f"{name}.h5"
         row: dict[str, Any] = {"map_device": map_, "query_device": query, "state": "evaluated"}
         rows.append(row)
-        try:
-            sessions = capture[f"{query}_query"], capture[f"{map_}_map"]
-        except CaptureError as error:
-            row["state"] = f"{LEFT_OUT}{error}"
-            continue
-        if causes := [cause for folder in references.values() if (cause := left_out(folder, name))]:
-            row["state"] = f"{LEFT_OUT}{causes[0]}"  # the files are those of an earlier run
-            continue
-        if h5 is not None and (older := why_older(h5.with_suffix(".txt"), "localize", (".npz",), missing=False)):
-            row["state"] = f"{LEFT_OUT}{older}"
+        # Files of a pair that was left out are those of an earlier run.
+        causes = [_unreadable(capture, f"{query}_query") or _unreadable(capture, f"{map_}_map")]
+        causes += [left_out(folder, name) for folder in references.values()]
+        if h5 is not None:
+            causes.append(why_older(h5.with_suffix(".txt"), "localize", (".npz",), missing=False))
+        if cause := next(filter(None, causes), ""):
+            row["state"] = f"{LEFT_OUT}{cause}"
             continue
         local_map = load(map_files(map_dir, f"{map_}_map", h5))
         for column, folder in references.items():
-            row |= _overlap(Path(folder) / f"{name}.jsonl", column, *sessions, local_map)
+            path = Path(folder) / f"{name}.jsonl"
+            row |= _overlap(path, column, capture[f"{query}_query"], capture[f"{map_}_map"], local_map)
     return _table(pd.DataFrame(rows), "images", "points")
 
 
@@ -549,19 +519,16 @@ def _overlap(
     if session.ground_truth is None:
         return {"state": "no ground truth"}
     try:
-        lines = read_references(path, "device_id", "Trs")
+        lines, shares = read_references(path, "device_id", "Trs"), []
         times, devices = [int(line["timestamp"]) for line in lines], [line["device_id"] for line in lines]
-        cameras = session.ground_truth.lookup(times, devices) @ np.array([x["Trs"] for x in lines]).reshape(-1, 4, 4)
-        shares = []
-        for line, camera in zip(lines, cameras, strict=True):
-            if is_posed(camera):
-                first = line["topk"][:1]
-                seen = seen_by(first[0], map_session, local_map) if first else np.zeros((0, 3))
-                center = np.array(first[0]["Tws"])[:3, 3] if first else np.zeros(3)
-                shares.append(overlap_in_view(seen, center, camera, session.camera(line["sensor_id"])))
+        poses = session.ground_truth.lookup(times, devices) @ np.array([x["Trs"] for x in lines]).reshape(-1, 4, 4)
+        for line, pose in zip(lines, poses, strict=True):
+            if is_posed(pose):
+                seen_from = map_session, local_map, pose, session.camera(line["sensor_id"])
+                shares.append(metrics.overlap_of(line["topk"][0], *seen_from) if line["topk"] else 0.0)
     except (ArtifactError, CaptureError, OSError, ValueError, KeyError, TypeError) as error:
         return {"state": f"{path.name} of the {name} cannot be read ({type(error).__name__})"}
     row: dict[str, Any] = {"images": len(shares), "points": "view" if local_map is None else "map"}
     if shares:
-        row |= {name: float(np.mean(np.array(shares) >= LEAST_OVERLAP)), f"{name}_mean": float(np.mean(shares))}
+        row |= {name: float(np.mean(np.array(shares) >= metrics.MIN_OVERLAP)), f"{name}_mean": float(np.mean(shares))}
     return row

@@ -217,14 +217,11 @@ def read_sidecar(path: str | Path) -> dict[str, Any] | None:
     A warning names what is damaged or missing.
     """
     record = _read_record(path)
-    settings = record.get("settings")
     if record.get("version") != __version__ or record.get("unfinished") or not record.get("files"):
         return None
-    whole = isinstance(settings, dict) and record.get("fingerprint") == fingerprint(settings)
-    whole = whole and record.get("sources", "") in ("", fingerprint(record.get("made_from")))
-    if damage := _damage(path, record) or ("" if whole else f"{sidecar_path(path)} is damaged"):
+    if damage := _damage(path, record):
         log.warning("%s: not reused.", damage)
-    return None if damage else settings
+    return None if damage else record["settings"]
 
 
 def is_current(path: str | Path, settings: dict[str, Any]) -> bool:
@@ -256,8 +253,8 @@ def changed_sources(artifact: str | Path) -> list[Path]:
     two do not belong together. An artifact without a record is from another tool, and as current as can be known.
     """
     recorded = _read_record(artifact).get("made_from")
-    sources = recorded.items() if isinstance(recorded, dict) else ()
-    paths = [(Path(os.path.normpath(Path(artifact).parent / name)), content) for name, content in sources]
+    sources = recorded if isinstance(recorded, dict) else {}
+    paths = [(Path(os.path.normpath(Path(artifact).parent / name)), sources[name]) for name in sources]
     return [path for path, content in paths if _content(path) != content]
 
 
@@ -270,8 +267,7 @@ def why_older(artifact: str | Path, stage: str, suffixes: Iterable[str] = (), mi
         missing: whether a source that is missing counts as changed.
     """
     changed = [path for path in changed_sources(artifact) if missing or path.exists()]
-    if suffixes:
-        changed = [path for path in changed if path.suffix in suffixes]
+    changed = [path for path in changed if not suffixes or path.suffix in suffixes]
     if not changed:
         return ""
     name, first = Path(artifact).name, f"{changed[0].parent.name}/{changed[0].name}"
@@ -340,7 +336,7 @@ def _read_record(path: str | Path) -> dict[str, Any]:
 
 
 def _damage(path: str | Path, record: dict[str, Any], only: str | None = None) -> str:
-    """Return what is wrong with the files of an artifact, or only with the one named `only`; empty if nothing is."""
+    """Return what is wrong with the files and the record of an artifact, or only with the file named `only`."""
     try:
         for name, (size, expected) in record.get("files", {}).items():
             file = Path(path).with_name(name)
@@ -352,11 +348,13 @@ def _damage(path: str | Path, record: dict[str, Any], only: str | None = None) -
                 return f"{file} is damaged ({found} bytes; {size} were written)"
             if expected is not None and checksum(file) != expected:
                 return f"{file} is damaged (its content is not what was written)"
+        parts = {"fingerprint": record.get("settings"), "sources": record.get("made_from")}
+        whole = only or all(record.get(name) == fingerprint(part) for name, part in parts.items())
     except OSError as error:
         return f"{error.filename or path} cannot be read ({error.strerror})"
     except (ValueError, TypeError, AttributeError):
-        return f"{sidecar_path(path)} is damaged"
-    return ""
+        whole = False
+    return "" if whole else f"{sidecar_path(path)} is damaged"
 
 
 def _jsonable(value: Any) -> Any:
@@ -465,8 +463,7 @@ def pair_devices(stem: str) -> tuple[str, str]:
 
 def of_sequence(name: str) -> bool:
     """Tell by its name whether a file is from the sequence stage, which writes beside the poses of single queries."""
-    _, query, rest = name.rpartition("_query_")
-    return bool(query) and "_sequence" in rest
+    return "_query_" in name and "_sequence" in name.rpartition("_query_")[2]
 
 
 def map_record_path(poses_dir: str | Path, scene: str, map_device: str) -> Path:

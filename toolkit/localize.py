@@ -3,12 +3,12 @@
 import json
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pandas as pd
@@ -37,7 +37,7 @@ from toolkit.files import (
     write_sidecar,
     write_text,
 )
-from toolkit.geometry import Floats, qt_from_pose
+from toolkit.geometry import Ints
 from toolkit.manifest import LocalizeSettings
 from toolkit.mapping.build import map_settings
 from toolkit.pose.base import Query, QueryInput, References
@@ -122,45 +122,24 @@ def localize_pairs(
     """
     settings = resolve_auto(LocalizeSettings.of(settings))
     folders = _Folders(*map(Path, (sessions_root, retrieval_dir, out_dir, features_dir, map_dir)))
-    stage = _Stage(folders, settings, queries, skip_existing, workers or default_workers())
+    stage = _Stage(folders, settings, queries, skip_existing, workers)
     capture, settings = stage.capture, stage.settings
     table = PairRows(capture.name, folders.out, folders.retrieval)
     query_tables: dict[str, list[pd.DataFrame]] = {}
-    devices = capture.pairs(map_device, query_device, pairs)
     with fixed_sums:
-        for mapped, queried in devices:
-            pair = _Pair(stage, mapped, queried)
-            with table.row(mapped, queried) as row:
+        for devices in capture.pairs(map_device, query_device, pairs):
+            pair = _Pair(stage, *devices)
+            with table.row(*devices) as row:
                 table.check_upstream()
-                started = time.perf_counter()
-                record = stage.record(pair)
-                h5_attributes = attributes(settings, stage.kinds, capture, mapped, folders.retrieval)
-                skipped = stage.is_current(pair, record, h5_attributes)
-                unfinished = False
-                if not skipped:
-                    run = stage.run(mapped, queried)
-                    localized = run.localize(record, h5_attributes)
-                    write_text(pair.map_record, json.dumps(run.map.record(), indent=1) + "\n")
-                    write_sidecar(pair.map_record, stage.made_from(h5_attributes))
-                    _write_poses(pair, localized, settings)
-                    unfinished = run.unfinished
-                if update_attributes(pair.file("h5"), h5_attributes) or not skipped:
-                    maps = [stage.folders.map / name for name in json.loads(h5_attributes[MAPS])]
-                    write_sidecar(
-                        *(pair.file("txt"), record, [pair.file("csv"), pair.file("h5")]),
-                        made_from=[pair.retrieval, *maps],
-                        unfinished=unfinished,
-                    )
+                skipped = pair.update()
                 rows = read_query_table(pair.file("csv"), ["status"])
-                query_tables.setdefault(queried, []).append(rows)
-                counts = status_counts(rows["status"])
+                query_tables.setdefault(devices[1], []).append(rows)
                 of_map = read_map_record(pair.map_record)
                 row |= {
                     "queries": len(rows),
-                    **counts,
+                    **status_counts(rows["status"]),
                     "escalated": int(rows["first_status"].notna().sum()) if settings.features.escalation else 0,
                     "map_poses": "inconsistent" if of_map["camera"] else of_map["verdict"],
-                    "seconds": round(time.perf_counter() - started, 2),
                     "skipped": skipped,
                     "path": str(pair.file("txt")),
                 }
@@ -169,43 +148,7 @@ def localize_pairs(
     for queried, tables in query_tables.items():
         for message in camera_messages(capture[f"{queried}_query"], tables):
             log.warning(message)
-    frame = table.frame()
-    write_text(Path(out_dir) / "settings.json", settings.model_dump_json(indent=1) + "\n")
-    return frame
-
-
-@dataclass(frozen=True)
-class _Pair:
-    """One pair of map device and query device: its files and its queries."""
-
-    stage: "_Stage"
-    map_device: str
-    query_device: str
-
-    @property
-    def retrieval(self) -> Path:
-        name = pair_name(self.stage.capture.name, self.map_device, self.query_device)
-        return self.stage.folders.retrieval / f"{name}.jsonl"
-
-    @property
-    def map_record(self) -> Path:
-        return map_record_path(self.stage.folders.out, self.stage.capture.name, self.map_device)
-
-    def file(self, suffix: str) -> Path:
-        return self.stage.folders.out / f"{self.retrieval.stem}.{suffix}"
-
-    def remove_poses(self) -> None:
-        """Remove the poses of an earlier run. The items stay: from them they can be written again quickly."""
-        for poses in (self.file("txt"), sidecar_path(self.file("txt")), self.file("csv")):
-            poses.unlink(missing_ok=True)
-
-    @property
-    def session(self) -> Session:
-        return self.stage.capture[f"{self.query_device}_query"]
-
-    @property
-    def keyframes(self) -> pd.DataFrame:
-        return self.session.keyframes(self.stage.queries)
+    return table.frame(settings)
 
 
 class _Folders(NamedTuple):
@@ -256,65 +199,12 @@ class _Stage(Remade):
         upright = needs_upright(self.settings, [*self.kinds, *self.escalation])
         return upright_turns(self.capture, self.settings.world_up) if upright else None
 
-    def record(self, pair: _Pair) -> dict[str, Any]:
-        """Return everything that the poses of a pair depend on."""
-        map_session, keyframes = self.capture[f"{pair.map_device}_map"], pair.keyframes
-        settings, predictor = self.settings, self.predictor
-        if not pair.retrieval.exists():
-            read_references(pair.retrieval)  # raises an error that names the missing file
-        record: dict[str, Any] = {
-            "method": settings.method,
-            "pnp": settings.pnp.model_dump() | {"seed": settings.seed, "format": PNP_FORMAT},
-            "misfit": [SIGNIFICANCE, MAX_SHARES],
-            "map": settings.map and map_settings(settings.map, settings.seed),
-            "features": [kind.extractor.settings for kind in self.kinds],
-            "matchers": [kind.matcher.settings for kind in self.kinds],
-            "unit": settings.unit,
-            "retrieval": file_fingerprint(pair.retrieval),
-            "map_session": session_fingerprint(map_session),
-            "query_session": session_fingerprint(pair.session),
-            "images": [map_session.files_fingerprint, pair.session.files_fingerprint],
-            "keyframes": fingerprint([keyframes["timestamp"].astype(str).tolist(), keyframes["device_id"].tolist()]),
-        }
-        if self.escalation:
-            record["escalation"] = {
-                "features": settings.features.model_dump(exclude={"checkpoint"}),
-                "matcher": settings.matcher.model_dump(exclude={"checkpoint"}),
-                "weights": [file_fingerprint(path) for path in weights_files(settings)],
-            }
-        if self.turns is not None:  # they follow from all maps of the capture, not only from that of this pair
-            record["turns"] = self.turns.fingerprint([map_session, pair.session])
-        if predictor is not None:
-            record |= {
-                "predictor": {"name": predictor.name} | predictor.settings,
-                "references": settings.predictor.num_references,
-                "depths": map_session.depths_fingerprint,
-            }
-        return record
-
-    def is_current(self, pair: _Pair, record: dict[str, Any], h5_attributes: Mapping[str, str]) -> bool:
-        """Tell whether to reuse the poses of a pair: they fit its record, and the files of its map still exist."""
-        if not self.skip_existing:
-            return False
-        made_from = self.made_from(h5_attributes)
-        maps_exist = None not in made_from["maps"] and is_current(pair.map_record, made_from)
-        return maps_exist and is_current(pair.file("txt"), record)
-
-    def made_from(self, h5_attributes: Mapping[str, str]) -> dict[str, Any]:
-        """Return everything that the record of a map depends on. All pairs of the map share it, so it has its own."""
-        maps = [self.folders.map / name for name in json.loads(h5_attributes[MAPS])]
-        return {"unit": self.settings.unit, "maps": [read_sidecar(path) for path in maps]}
-
     def _open_map(self, device: str) -> Map:
         scene_map = Map(
             device, self.capture.path / "sessions", self.folders.map, self.settings, self.kinds, (), self.escalation,
             self.folders.features, predictor=self.predictor,
         )  # fmt: skip
         return scene_map.build(self.workers, self.skip_existing)
-
-    def run(self, map_device: str, query_device: str) -> "_PairRun":
-        """Open the map of a pair and the features of its queries."""
-        return _PairRun(_Pair(self, map_device, query_device), self.open_map(map_device))
 
     @property
     def networks(self) -> dict[str, Any]:
@@ -332,39 +222,120 @@ _Todo = tuple[str, str, int]
 """Name of a query's item, fingerprint of its sources, and number of the query."""
 _Task = tuple[int, QueryInput, Any, float]
 """Number of a query, the query, what is known of it (a prediction, or its first result), and seconds spent on it."""
-_Row = tuple[dict[str, Any], Floats, Floats]
-"""Row of a query in the table, its pose (4, 4) and covariance (6, 6), NaN if unknown."""
-_Results = dict[int, QueryResult]
-"""Queries that failed with an internal error, by number. They get no item, so the next run tries them again."""
 _RETRIED = "/retried"
 """Ends the name of a query's item with the fallback features. It has no arrays if the first correspondences count."""
 
 
-class _PairRun:
-    """Localizes the queries of one pair."""
+class _Pair:
+    """One pair of map device and query device: its files, and the localization of its queries."""
 
-    def __init__(self, pair: _Pair, scene_map: Map) -> None:
-        self.pair, self.map, self.stage = pair, scene_map, pair.stage
-        keyframes = pair.keyframes
-        self.keys = list(zip(keyframes["timestamp"].tolist(), keyframes["device_id"].tolist(), strict=True))
-        self.rows = pair.session.rows_of_keyframes(keyframes)
+    def __init__(self, stage: _Stage, map_device: str, query_device: str) -> None:
+        self.stage, self.devices = stage, (map_device, query_device)
+        self.stem = pair_name(stage.capture.name, map_device, query_device)
+        self.retrieval = stage.folders.retrieval / f"{self.stem}.jsonl"
+        self.map_record = map_record_path(stage.folders.out, stage.capture.name, map_device)
+        self.label = f"localize {query_device} in {map_device}"
+
+    def file(self, suffix: str) -> Path:
+        return self.stage.folders.out / f"{self.stem}.{suffix}"
+
+    def remove_poses(self) -> None:
+        """Remove the poses of an earlier run. The items stay: from them they can be written again quickly."""
+        for poses in (self.file("txt"), sidecar_path(self.file("txt")), self.file("csv")):
+            poses.unlink(missing_ok=True)
+
+    @cached_property
+    def session(self) -> Session:
+        return self.stage.capture[f"{self.devices[1]}_query"]
+
+    @cached_property
+    def keyframes(self) -> pd.DataFrame:
+        return self.session.keyframes(self.stage.queries)
+
+    @cached_property
+    def keys(self) -> list[tuple[int, str]]:
+        return list(zip(self.keyframes["timestamp"].tolist(), self.keyframes["device_id"].tolist(), strict=True))
+
+    @cached_property
+    def rows(self) -> list[Ints]:
         """For each query, the rows of its images."""
-        self.stored = StoredQueries(pair.session, pair.retrieval)
-        self.unfinished = False
-        """Whether a query failed with an internal error."""
-        if scene_map.settings.method not in WITHOUT_FEATURES:
-            for kind in scene_map.kinds:
-                self._add_kind(kind, range(len(self.keys)))
+        return self.session.rows_of_keyframes(self.keyframes)
 
-    def _add_kind(self, kind: AnyMethod, numbers: Sequence[int]) -> None:
+    def record(self) -> dict[str, Any]:
+        """Return everything that the poses of the pair depend on."""
+        stage, map_session = self.stage, self.stage.capture[f"{self.devices[0]}_map"]
+        settings, sessions, keyframes = stage.settings, [map_session, self.session], self.keyframes
+        if not self.retrieval.exists():
+            read_references(self.retrieval)  # raises an error that names the missing file
+        record: dict[str, Any] = {
+            "method": settings.method,
+            "pnp": settings.pnp.model_dump() | {"seed": settings.seed, "format": PNP_FORMAT},
+            "misfit": [SIGNIFICANCE, MAX_SHARES],
+            "map": settings.map and map_settings(settings.map, settings.seed),
+            "features": [kind.extractor.settings for kind in stage.kinds],
+            "matchers": [kind.matcher.settings for kind in stage.kinds],
+            "unit": settings.unit,
+            "retrieval": file_fingerprint(self.retrieval),
+            "map_session": session_fingerprint(map_session),
+            "query_session": session_fingerprint(self.session),
+            "images": [session.files_fingerprint for session in sessions],
+            "keyframes": fingerprint([keyframes["timestamp"].astype(str).tolist(), keyframes["device_id"].tolist()]),
+        }
+        if stage.escalation:
+            record["escalation"] = {
+                "features": settings.features.model_dump(exclude={"checkpoint"}),
+                "matcher": settings.matcher.model_dump(exclude={"checkpoint"}),
+                "weights": [file_fingerprint(path) for path in weights_files(settings)],
+            }
+        if stage.turns is not None:  # they follow from all maps of the capture, not only from that of this pair
+            record["turns"] = stage.turns.fingerprint(sessions)
+        if stage.predictor is not None:
+            record |= {
+                "predictor": {"name": stage.predictor.name} | stage.predictor.settings,
+                "references": settings.predictor.num_references,
+                "depths": map_session.depths_fingerprint,
+            }
+        return record
+
+    def update(self) -> bool:
+        """Localize the queries and write all files, unless they are current: then return True."""
+        stage, record = self.stage, self.record()
+        h5_attributes = attributes(stage.settings, stage.kinds, stage.capture, self.devices[0], stage.folders.retrieval)
+        maps = [stage.folders.map / name for name in json.loads(h5_attributes[MAPS])]
+        of_map = self._made_from(maps)
+        skipped = stage.skip_existing and None not in of_map["maps"] and is_current(self.map_record, of_map)
+        skipped = skipped and is_current(self.file("txt"), record)
+        unfinished = False
+        if not skipped:
+            self.open()
+            rows, unfinished = self._localize(record, h5_attributes)
+            write_text(self.map_record, json.dumps(self.map.record(), indent=1) + "\n")
+            write_sidecar(self.map_record, self._made_from(maps))  # its own: all pairs of the map share it
+            _write_poses(self.file("txt"), rows, stage.settings)
+        if update_attributes(self.file("h5"), h5_attributes) or not skipped:
+            files = self.file("txt"), record, [self.file("csv"), self.file("h5")]
+            write_sidecar(*files, made_from=[self.retrieval, *maps], unfinished=unfinished)
+        return skipped
+
+    def _made_from(self, maps: Sequence[Path]) -> dict[str, Any]:
+        """Return everything that the record of the map depends on."""
+        return {"unit": self.stage.settings.unit, "maps": [read_sidecar(path) for path in maps]}
+
+    def open(self) -> Self:
+        """Open the map, and the references and features of the queries."""
+        self.map = self.stage.open_map(self.devices[0])
+        self.stored = StoredQueries(self.session, self.retrieval)
+        if self.map.settings.method not in WITHOUT_FEATURES:
+            self._add_features(self.map.kinds, range(len(self.keys)))
+        return self
+
+    def _add_features(self, kinds: Sequence[AnyMethod], numbers: Iterable[int]) -> None:
         """Extract features of query images, and match them with their references if the matcher is a network.
 
-        If the map has no features of this kind, also extract those of the references.
+        If the map has no features of a kind, also extract those of the references.
         """
-        session, scene_map, stage = self.pair.session, self.map, self.stage
+        session, scene_map, stage = self.session, self.map, self.stage
         rows = np.unique(np.concatenate([*(self.rows[number] for number in numbers), np.zeros(0, np.int64)]))
-        turns = scene_map.turns_of(kind, session)
-        store = extract_session(session, stage.folders.features, kind.extractor, rows, stage.workers, turns=turns)
         images = session.images.iloc[rows]
         keys = zip(images["timestamp"].tolist(), images["sensor_id"].tolist(), strict=True)
         names = [
@@ -373,91 +344,74 @@ class _PairRun:
             for name, _ in self.stored.references.get(key, [])
             if name in scene_map.index_of
         ]
-        map_features = next((mapped.features for mapped in scene_map.mapped if mapped.name == kind.name), None)
-        if map_features is None:
-            references = dict.fromkeys(name for _, name in names)
-            map_features = scene_map.on_demand(kind).prepare(references, stage.workers, stage.skip_existing)
-        matches = None
-        if isinstance(map_features, FeatureStore) and not isinstance(kind.matcher, MutualMatcher):
-            sessions = session.id, f"{scene_map.device}_map"
-            stores = store, map_features
-            matches = match_sessions(stores, names, kind.matcher, scene_map.map_dir, sessions, stage.skip_existing)
-        self.stored.stores.append(store)
-        self.stored.matches.append(matches)
+        for kind in kinds:
+            turns = scene_map.turns_of(kind, session)
+            store = extract_session(session, stage.folders.features, kind.extractor, rows, stage.workers, turns=turns)
+            map_features = next((mapped.features for mapped in scene_map.mapped if mapped.name == kind.name), None)
+            if map_features is None:
+                references = dict.fromkeys(name for _, name in names)
+                map_features = scene_map.on_demand(kind).prepare(references, stage.workers, stage.skip_existing)
+            matches = None
+            if isinstance(map_features, FeatureStore) and not isinstance(kind.matcher, MutualMatcher):
+                sessions, stores = (session.id, f"{scene_map.device}_map"), (store, map_features)
+                matches = match_sessions(stores, names, kind.matcher, scene_map.map_dir, sessions, stage.skip_existing)
+            self.stored.stores.append(store)
+            self.stored.matches.append(matches)
 
     def query(self, number: int) -> QueryInput:
         return self.stored.query(self.map, self.rows[number])
 
-    def localize(self, record: dict[str, Any], h5_attributes: Mapping[str, str]) -> "list[_Row]":
-        """Localize the queries that are not localized yet, and write the `.h5` file; return a row per query."""
+    def _localize(self, record: dict[str, Any], h5_attributes: Mapping[str, str]) -> tuple[list[dict[str, Any]], bool]:
+        """Localize the queries that are not localized yet, and write the `.h5` file.
+
+        Returns:
+            Row of each query, with world_from_rig (4, 4) and covariance (6, 6), NaN if unknown; and whether a query
+            failed with an internal error.
+        """
         names, source = [query_group(*key) for key in self.keys], fingerprint(record)
         numbers = {name: number for number, name in enumerate(names)}  # a keyframe list may repeat a query
-        with Items(self.pair.file("items"), again=not self.stage.skip_existing) as items:
+        with Items(self.file("items"), again=not self.stage.skip_existing) as items:
             items.drop_damaged()
-            todo = items.spread(
-                _localize_share, items.left((name, source, number) for name, number in numbers.items()),
-                (self.stage.of_worker, *self.devices), self._label, "query", self.map.localizer.batch_size,
-            )  # fmt: skip
-            faulty = self.localize_into(items, todo)
+            todo = items.left((name, source, number) for name, number in numbers.items())
+            faulty = self._spread(items, todo)
             if self.map.fallback is not None:
                 items.flush()
-                localized = [(name, source, number) for name, number in numbers.items() if number not in faulty]
-                faulty |= self._retry(items, localized)
-        last = {name: name + _RETRIED * items.is_current(name + _RETRIED, source) for name in numbers}
+                retried = [
+                    (name + _RETRIED, source, number) for name, number in numbers.items() if number not in faulty
+                ]
+                todo = [
+                    one
+                    for one in items.left(retried)
+                    if self.map.needs_fallback(*self.query(one[2]), self._first(items, one))
+                ]
+                if todo:
+                    started = time.perf_counter()
+                    self.add_fallback(todo)
+                    faulty |= self._spread(items, todo, (time.perf_counter() - started) / len(todo))
         # If the run is killed before it writes the new poses, no poses of an earlier run may lie beside this file.
-        for poses in (self.pair.file("txt"), sidecar_path(self.pair.file("txt"))):
+        for poses in (self.file("txt"), sidecar_path(self.file("txt"))):
             poses.unlink(missing_ok=True)
-        self.unfinished = bool(faulty)
-        rows = dict[str, _Row]()
+        rows = dict[str, dict[str, Any]]()
 
         def groups() -> Iterator[tuple[str, dict[str, Any]]]:
             for name, number in numbers.items():
                 if number in faulty:
                     row, arrays = faulty[number].to_row(*self.keys[number]), faulty[number].arrays()
                 else:
-                    row, arrays = items.note(last[name]), items[last[name]] or items[name]
-                rows[name] = row, arrays["world_from_rig"], arrays["covariance"]
+                    last = name + _RETRIED * items.is_current(name + _RETRIED, source)
+                    row, arrays = items.note(last), items[last] or items[name]
+                rows[name] = row | {key: arrays[key] for key in ("world_from_rig", "covariance")}
                 yield name, arrays
 
-        write_groups(self.pair.file("h5"), groups(), h5_attributes)
-        images = self.pair.session.own_names(self.rows)
-        return [(rows[name][0] | {"image": image}, *rows[name][1:]) for name, image in zip(names, images, strict=True)]
+        write_groups(self.file("h5"), groups(), h5_attributes)
+        images = self.session.own_names(self.rows)
+        return [rows[name] | {"image": image} for name, image in zip(names, images, strict=True)], bool(faulty)
 
-    @property
-    def devices(self) -> tuple[str, str]:
-        """Map device and query device."""
-        return self.pair.map_device, self.pair.query_device
-
-    @property
-    def _label(self) -> str:
-        return f"localize {self.pair.query_device} in {self.pair.map_device}"
-
-    def localize_into(self, items: Items, todo: Sequence[_Todo]) -> _Results:
-        """Localize queries and add them as items; return those that failed with an internal error."""
-        faulty: _Results = {}
-        of_number = {number: (name, source) for name, source, number in todo}
-        for number, result in self._run(self._locate, self._predicted(list(of_number)), len(todo)):
-            if result.is_internal:
-                faulty[number] = result
-            else:
-                items.add(*of_number[number], result.arrays(), result.to_row(*self.keys[number]))
-        return faulty
-
-    def _retry(self, items: Items, localized: Sequence[_Todo]) -> _Results:
-        """Retry unsure queries with the fallback features; return as `localize_into`."""
-        retried = [(name + _RETRIED, source, number) for name, source, number in localized]
-        todo = [
-            one
-            for one in items.left(retried)
-            if self.map.needs_fallback(*self.query(one[2]), self._first(items, one))
-        ]
-        if not todo:
-            return {}
-        started = time.perf_counter()
-        self.add_fallback(todo)
-        shared = (time.perf_counter() - started) / len(todo)
-        todo = items.spread(_retry_share, todo, (self.stage.of_worker, *self.devices, shared), self._label, "query")
-        return self.retry_into(items, todo, shared)
+    def _spread(self, items: Items, todo: Sequence[_Todo], *retry_s: float) -> dict[int, QueryResult]:
+        """Localize queries, with the workers of the cluster if there is one; see `localize_into`."""
+        arguments, size = (self.stage.of_worker, *self.devices, *retry_s), self.map.localizer.batch_size
+        todo = items.spread(_do_share, todo, arguments, self.label, "query", 1 if retry_s else size)
+        return self.localize_into(items, todo, *retry_s)
 
     def _first(self, items: Items, todo: _Todo) -> QueryResult:
         """Return the stored result of a query from the features that every query has."""
@@ -466,28 +420,34 @@ class _PairRun:
 
     def add_fallback(self, todo: Sequence[_Todo]) -> None:
         """Extract and match the fallback features of queries."""
-        for kind in self.map.escalation:
-            self._add_kind(kind, [number for _, _, number in todo])
+        self._add_features(self.map.escalation, [number for _, _, number in todo])
 
-    def retry_into(self, items: Items, todo: Sequence[_Todo], shared: float) -> _Results:
-        """Retry queries with the fallback features, which are extracted; add the better results as items.
+    def localize_into(
+        self, items: Items, todo: Sequence[_Todo], retry_s: float | None = None
+    ) -> dict[int, QueryResult]:
+        """Localize queries and add them as items.
 
         Args:
-            shared: seconds per query that the extraction took.
+            retry_s: retry unsure queries with the fallback features, whose extraction took these seconds per query;
+                an item gets arrays only if the result is better.
 
         Returns:
-            As `localize_into`.
+            Queries that failed with an internal error, by number. They get no item, so the next run tries them again.
         """
-        faulty: _Results = {}
-        firsts = {one[2]: self._first(items, one) for one in todo}
+        faulty = dict[int, QueryResult]()
         of_number = {number: (name, source) for name, source, number in todo}
-        tasks = ((number, self.query(number), firsts[number], shared) for number in of_number)
-        for number, result in self._run(self.map.retry, tasks, len(todo)):
+        firsts = {} if retry_s is None else {one[2]: self._first(items, one) for one in todo}
+        if retry_s is None:
+            results = self._run(self._locate, self._predicted(list(of_number)), len(todo))
+        else:
+            tasks = ((number, self.query(number), firsts[number], retry_s) for number in of_number)
+            results = self._run(self.map.retry, tasks, len(todo))
+        for number, result in results:
             if result.is_internal:
                 faulty[number] = result
             else:
-                better = result.correspondences is not firsts[number].correspondences
-                items.add(*of_number[number], result.arrays() if better else None, result.to_row(*self.keys[number]))
+                same = number in firsts and result.correspondences is firsts[number].correspondences
+                items.add(*of_number[number], None if same else result.arrays(), result.to_row(*self.keys[number]))
         return faulty
 
     def _run(
@@ -508,7 +468,7 @@ class _PairRun:
             return number, replace(result, seconds=result.seconds + seconds)
 
         results = prefetch(run, tasks, self.stage.workers)
-        return iter(tqdm(results, total=count, desc=self._label, unit="query", disable=not count))
+        return iter(tqdm(results, total=count, desc=self.label, unit="query", disable=not count))
 
     def _locate(self, query: Query, references: Sequence[References], prediction: Any) -> QueryResult:
         return self.map.locate(query, None, references, prediction, fallback=False)
@@ -526,36 +486,29 @@ class _PairRun:
                 yield number, query, prediction, seconds
 
 
-def _localize_share(
-    items: Items, todo: Sequence[_Todo], stage: _Stage, map_device: str, query_device: str
+def _do_share(
+    items: Items, todo: Sequence[_Todo], stage: _Stage, map_device: str, query_device: str, *retry_s: float
 ) -> None:
-    stage.run(map_device, query_device).localize_into(items, todo)
+    pair = _Pair(stage, map_device, query_device).open()
+    if retry_s:
+        pair.add_fallback(todo)
+    pair.localize_into(items, todo, *retry_s)
 
 
-def _retry_share(
-    items: Items, todo: Sequence[_Todo], stage: _Stage, map_device: str, query_device: str, shared: float
-) -> None:
-    run = stage.run(map_device, query_device)
-    run.add_fallback(todo)
-    run.retry_into(items, todo, shared)
-
-
-def _write_poses(pair: _Pair, rows: Sequence[_Row], settings: LocalizeSettings) -> None:
+def _write_poses(path: Path, rows: Sequence[dict[str, Any]], settings: LocalizeSettings) -> None:
     """Write the table and the poses of a pair; the poses last, because their file marks the pair as finished."""
     columns = [*COLUMNS, *(PREDICTION_COLUMNS if settings.predicts else [])]
     columns += FALLBACK_COLUMNS if settings.features.escalation else []
-    table = pd.DataFrame([row for row, _, _ in rows], columns=columns)
-    with write_atomic(pair.file("csv")) as temporary:
-        in_unit_of_poses(table, settings.unit).to_csv(temporary, index=False)
-    posed = [row for row in rows if np.isfinite(row[1]).all()]
-    covariances = np.array([covariance for _, _, covariance in posed]).reshape(-1, 6, 6)
-    trajectory = Trajectory(
-        np.array([row["timestamp"] for row, _, _ in posed], np.int64),
-        [row["device_id"] for row, _, _ in posed],
-        np.array([qt_from_pose(pose) for _, pose, _ in posed], np.float64).reshape(-1, 7),
+    with write_atomic(path.with_suffix(".csv")) as temporary:
+        in_unit_of_poses(pd.DataFrame(rows, columns=columns), settings.unit).to_csv(temporary, index=False)
+    posed = [row for row in rows if np.isfinite(row["world_from_rig"]).all()]
+    covariances = np.array([row["covariance"] for row in posed]).reshape(-1, 6, 6)
+    Trajectory.from_poses(
+        [row["timestamp"] for row in posed],
+        [row["device_id"] for row in posed],
+        np.array([row["world_from_rig"] for row in posed]).reshape(-1, 4, 4),
         None if np.isnan(covariances).all() else covariances,
-    )
-    trajectory.write(pair.file("txt"))
+    ).write(path)
 
 
 def explain_query(
@@ -587,8 +540,9 @@ def explain_query(
         raise ToolkitError(f"The method {settings.method} does not use a predictor. Use feed_forward or hybrid.")
     settings = resolve_auto(LocalizeSettings.of(settings, {"method": "feed_forward"}))
     folders = _Folders(*map(Path, (sessions_root, retrieval_dir, retrieval_dir, features_dir, map_dir)))
-    run = _Stage(folders, settings, queries, skip_existing=True, workers=1).run(map_device, query_device)
-    localizer = run.map.localizer
+    stage = _Stage(folders, settings, queries, skip_existing=True, workers=1)
+    pair = _Pair(stage, map_device, query_device).open()
+    localizer = pair.map.localizer
     assert isinstance(localizer, FeedForwardLocalizer)
-    query, references = run.query(index)
+    query, references = pair.query(index)
     return localizer, query, localizer.answer(query, references)

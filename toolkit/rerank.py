@@ -6,10 +6,10 @@ fit one essential matrix of the two calibrated cameras, so the right reference c
 
 import json
 import logging
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +97,6 @@ def rerank_pairs(
         for devices in capture.pairs(map_device, query_device, pairs):
             with table.row(*devices) as row:
                 table.check_upstream()
-                started = time.perf_counter()
                 sessions = capture[f"{devices[0]}_map"], capture[f"{devices[1]}_query"]
                 name = f"{pair_name(capture.name, *devices)}.jsonl"
                 pair = _Pair(*sessions, Path(retrieval_dir) / name, Path(out_dir) / name, method, settings, turns)
@@ -106,12 +105,8 @@ def rerank_pairs(
                     remove_items(pair.path)
                 else:
                     pair.rerank(Path(features_dir), workers, skip_existing)
-                row |= _counts(read_references(pair.path))
-                row |= {"seconds": round(time.perf_counter() - started, 2), "skipped": skipped}
-                row["path"] = str(pair.path)
-    frame = table.frame()
-    write_text(Path(out_dir) / "settings.json", settings.model_dump_json(indent=1) + "\n")
-    return frame
+                row |= _counts(read_references(pair.path)) | {"skipped": skipped, "path": str(pair.path)}
+    return table.frame(settings)
 
 
 @dataclass(frozen=True)
@@ -165,7 +160,7 @@ class _Pair:
             try:
                 return index, self._reranked(queries[index], verifier, *stores)
             except Exception as error:  # one bad query must not end the run
-                return index, self._kept(queries[index], reason_of(error, f"reranking {queries[index]['path']}"))
+                return index, self._row(queries[index], reason_of(error, f"reranking {queries[index]['path']}"))
 
         source = fingerprint(self.record)
         with Items(items_beside(self.path), again=not skip_existing) as progress:
@@ -190,15 +185,13 @@ class _Pair:
 
     def _rows(self, session: Session, images: Sequence[dict[str, Any]]) -> Ints:
         """Return the rows of `session.images` of images in the retrieval file; raise if the session lacks one."""
-        prefix = f"{session.path.name}/raw_data/"
         names = list(dict.fromkeys(_name(image) for image in images))
-        rows = pd.Index(session.images["path"]).get_indexer([name.removeprefix(prefix) for name in names])
-        if (rows < 0).any():
+        if lacking := [name for name in names if name not in session.row_of_name]:
             raise ArtifactError(
-                f"{self.retrieval}: {(rows < 0).sum()} images are not in {session.path / 'images.txt'}, first "
-                f"{names[int(np.argmax(rows < 0))]}. The file belongs to another capture: retrieve again."
+                f"{self.retrieval}: {len(lacking)} images are not in {session.path / 'images.txt'}, first "
+                f"{lacking[0]}. The file belongs to another capture: retrieve again."
             )
-        return np.asarray(rows, np.int64)
+        return np.array([session.row_of_name[name] for name in names], np.int64)
 
     def _reranked(
         self, query: dict[str, Any], verifier: Verifier, map_store: FeatureStore, query_store: FeatureStore
@@ -206,32 +199,34 @@ class _Pair:
         """Return a query image's row with its references in order of verified matches."""
         name, references = _name(query), query["topk"][: self.settings.topn]
         if name not in query_store:
-            return self._kept(query, query_store.failed.get(name, "no local features of the query image"))
+            return self._row(query, query_store.failed.get(name, "no local features of the query image"))
         names = [_name(reference) for reference in references]
         if not any(name in map_store for name in names):
-            return self._kept(query, "no reference has local features")
+            return self._row(query, "no reference has local features")
         cameras = [self.map_session.camera(reference["sensor_id"]) for reference in references]
         camera = self.query_session.camera(query["sensor_id"])
         counts = verifier.verify(query_store[name], camera, names, cameras)
         if not any(counts[0]):
-            return self._kept(query, "no reference agrees with the query by more than chance")
-        rows = [_entry(*entry) for entry in zip(references, *counts, strict=True)]
-        rows.sort(key=lambda row: (-row["score"], row["retrieval_rank"]))
-        return _row(query, rows[: self.settings.topk], "")
+            return self._row(query, "no reference agrees with the query by more than chance")
+        return self._row(query, "", zip(*counts, strict=True))
 
-    def _kept(self, query: dict[str, Any], reason: str) -> dict[str, Any]:
-        """Return a query image's row with its references in the order of retrieval."""
-        return _row(query, [_entry(reference, 0, 0) for reference in query["topk"][: self.settings.topk]], reason)
-
-
-def _entry(reference: dict[str, Any], inliers: int, matches: int) -> dict[str, Any]:
-    retrieved = {"retrieval_score": reference["score"], "retrieval_rank": reference["rank"]}
-    return reference | {"score": inliers, "num_matches": matches} | retrieved
-
-
-def _row(query: dict[str, Any], references: list[dict[str, Any]], reason: str) -> dict[str, Any]:
-    ranked = [reference | {"rank": rank} for rank, reference in enumerate(references, start=1)]
-    return query | {"topk": ranked, "reason": reason}
+    def _row(
+        self, query: dict[str, Any], reason: str, counts: Iterable[tuple[int, int]] = repeat((0, 0))
+    ) -> dict[str, Any]:
+        """Return a query image's row; `counts`: verified and all matches of each reference, which order them."""
+        references = [
+            {
+                **reference,
+                "score": inliers,
+                "num_matches": matches,
+                "retrieval_score": reference["score"],
+                "retrieval_rank": reference["rank"],
+            }
+            for reference, (inliers, matches) in zip(query["topk"][: self.settings.topn], counts, strict=False)
+        ]
+        references.sort(key=lambda row: (-row["score"], row["retrieval_rank"]))
+        ranked = [row | {"rank": rank} for rank, row in enumerate(references[: self.settings.topk], start=1)]
+        return query | {"topk": ranked, "reason": reason}
 
 
 def _counts(rows: list[dict[str, Any]]) -> dict[str, int]:

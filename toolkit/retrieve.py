@@ -23,7 +23,7 @@ from toolkit.embedders.index import EXACT, is_index_current, make_index
 from toolkit.embedders.search import Backend, Found, search
 from toolkit.embedders.stored import matrix_fingerprints, require_same_embedder
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
-from toolkit.files import file_fingerprint, fingerprint, is_current, pair_name, write_atomic, write_sidecar, write_text
+from toolkit.files import file_fingerprint, fingerprint, is_current, pair_name, write_atomic, write_sidecar
 from toolkit.geometry import Ints
 from toolkit.manifest import MaskSettings, RetrieveSettings
 from toolkit.runs.pairs import PairRows
@@ -78,8 +78,8 @@ def retrieve_pairs(
         that it leaves the whole map.
 
     Raises:
-        ToolkitError: unknown device; or all pairs fail: there is no such list, embeddings are missing or have
-            different dimensions. The message says which.
+        ToolkitError: unknown device; the file of `mask.poses` is missing or malformed; or all pairs fail: there is no
+            such list, embeddings are missing or have different dimensions. The message says which.
     """
     settings = RetrieveSettings.of(settings)
     capture = Capture.from_sessions_root(sessions_root)
@@ -90,7 +90,9 @@ def retrieve_pairs(
         raise ManifestError(f"out_jsonl is one file ({out}) for {len(chosen)} pairs; give a folder.")
     folder = out.parent if out.suffix == ".jsonl" else out
     table = PairRows(capture.name, folder)
-    poses = _rough_poses(settings.mask)
+    if (rough := settings.mask.poses) is not None and not Path(rough).is_file():
+        raise ManifestError(f"retrieve.mask.poses: found no file {rough}. Expected poses as in trajectories.txt.")
+    poses = None if rough is None else Trajectory.read(rough)
 
     @cache
     def load_queries(device: str) -> _Images:
@@ -123,28 +125,22 @@ def retrieve_pairs(
                     _require_same_dimension(query, database)
                     require_same_embedder(query.vectors, database.vectors)
                     todo[device] = replace(query, masks=masks), path, record
-                row |= query.counts | database.counts | without
-                row |= {"seconds": 0.0, "skipped": skipped, "path": str(path)}
+                row |= query.counts | database.counts | without | {"skipped": skipped, "path": str(path)}
         if not todo:
             continue
         found: dict[str, Found] = {}
         started = time.perf_counter()
-        find = partial(
-            _search, database=database, settings=settings, embeddings=embeddings, skip_existing=skip_existing
-        )
+        find = partial(_search, database=database, settings=settings, embeddings=embeddings, again=not skip_existing)
         with suppress(ArtifactError):  # a value is not finite: search pair by pair, so that only its row fails
             found = find({device: query for device, (query, _, _) in todo.items()})
         shared = (time.perf_counter() - started) / len(todo)
         for device, (query, path, record) in todo.items():
             with table.row(map_device, device) as row:
-                started = time.perf_counter()
                 found = found or find({device: query})
                 _write_pair(path, query, database, found.pop(device))
                 write_sidecar(path, record, made_from=_matrices(query.session, database.session, embeddings=embeddings))
-                row["seconds"] = round(shared + time.perf_counter() - started, 3)
-    frame = table.frame()
-    write_text(folder / "settings.json", settings.model_dump_json(indent=1) + "\n")
-    return frame
+                row["seconds"] += shared
+    return table.frame(settings)
 
 
 @dataclass(frozen=True)
@@ -220,7 +216,7 @@ def _require_same_dimension(query: _Images, database: _Images) -> None:
 
 
 def _search(
-    queries: Mapping[str, _Images], database: _Images, settings: RetrieveSettings, embeddings: Path, skip_existing: bool
+    queries: Mapping[str, _Images], database: _Images, settings: RetrieveSettings, embeddings: Path, again: bool
 ) -> dict[str, Found]:
     """Return the best map images of several sets of queries, with one pass over the map.
 
@@ -231,7 +227,7 @@ def _search(
     backend: Backend = "faiss" if settings.use_faiss else "torch"
     masks = [query.masks for query in queries.values() if query.masks is not None]
     try:
-        index = make_index(embeddings, database.session.id, database.vectors, settings, skip_existing)
+        index = make_index(embeddings, database.session.id, database.vectors, settings, not again)
         found = search(
             stacked, database.vectors, settings.topk, backend, settings.compute_device, settings.faiss_gpu, index,
             Masks.stack(masks) if masks else None, database.vectors.dims,
@@ -278,17 +274,6 @@ def _matrices(*sessions: Session, embeddings: Path) -> list[Path]:
     return [path for folder in folders for path in sorted(folder.rglob("*.npy"))]
 
 
-def _rough_poses(settings: MaskSettings) -> Trajectory | None:
-    if settings.poses is None:
-        return None
-    if not Path(settings.poses).is_file():
-        raise ManifestError(
-            f"retrieve.mask.poses: no such file: {settings.poses}. Expected poses of query devices in the map's frame, "
-            "in the format of trajectories.txt."
-        )
-    return Trajectory.read(settings.poses)
-
-
 def _masks(
     settings: RetrieveSettings, poses: Trajectory | None, database: _Images, query: _Images
 ) -> tuple[Masks | None, dict[str, int]]:
@@ -306,12 +291,11 @@ def _masks(
     if not priors:
         return None, {}
     masks, counts = combine(list(priors.values()))
-    without = dict(zip(priors, counts, strict=True))
-    for prior, count in without.items():
+    for prior, count in zip(priors, counts, strict=True):
         if count:
             message = "map %s, query %s: %s leaves the whole map to %d of %d query images"
             log.warning(message, database.session.id, query.session.id, prior, count, len(masks))
-    return masks, {f"without_{prior}": count for prior, count in without.items()}
+    return masks, {f"without_{prior}": count for prior, count in zip(priors, counts, strict=True)}
 
 
 def _mask_record(settings: MaskSettings, *sessions: Session) -> dict[str, Any]:

@@ -207,12 +207,8 @@ class _SingleQueries:
     keys: pd.DataFrame
     """Table [timestamp, device_id]."""
     status: NDArray[np.object_]
-    weights: Floats
-    """(Q,) probability that each pose is right."""
-    poses: Floats
-    """(Q, 4, 4), NaN for none."""
-    covariances: Floats
-    """(Q, 6, 6)."""
+    results: PosedQueries
+    """Of all queries, NaN for one without a pose; `frames` counts the queries."""
 
     @classmethod
     def of(cls, results: PairResults) -> "_SingleQueries":
@@ -220,18 +216,17 @@ class _SingleQueries:
         results = replace(results, table=rows)
         status = rows["status"].to_numpy(object)
         evidence = rows.reindex(columns=["p_correct", "rival_support"]).to_numpy(float)
-        weights = vote_weights(np.asarray(status == Status.OK), *evidence.T)
+        ok = np.asarray(status == Status.OK)
         known = np.asarray(np.isfinite(results.covariances).all(axis=(1, 2)), bool)
         covariances = np.asarray(np.where(known[:, None, None], results.covariances, UNKNOWN_COVARIANCE))
-        return cls(rows[["timestamp", "device_id"]], status, weights, results.poses, covariances)
+        queries = PosedQueries(np.arange(len(rows)), results.poses, covariances, vote_weights(ok, *evidence.T), ok)
+        return cls(rows[["timestamp", "device_id"]], status, queries)
 
     def posed(self, rows: Ints) -> PosedQueries:
         """Return the queries with a pose among the frames of a piece; rows (N,) as `rows_of` returns them."""
         frames = np.flatnonzero(rows >= 0)
-        frames = frames[np.isfinite(self.poses[rows[frames]]).all(axis=(1, 2))]
-        rows = rows[frames]
-        trusted = np.asarray(self.status[rows] == "ok")
-        return PosedQueries(frames, self.poses[rows], self.covariances[rows], self.weights[rows], trusted)
+        frames = frames[np.isfinite(self.results.world_from_rig[rows[frames]]).all(axis=(1, 2))]
+        return replace(self.results.choose(rows[frames]), frames=frames)
 
     def rows_of(self, timestamps: Ints, device_ids: Any) -> Ints:
         """Return the index of each frame's query (N,), -1 for none."""
@@ -307,8 +302,7 @@ def _frames(
         done = localize_piece(motion, queries, piece.query_frames, settings, again)
         placed = done.placed
         steps += _step_rows(piece, done.steps)
-        table = pd.DataFrame(dict.fromkeys(COLUMNS), index=range(len(motion)))
-        table[list(keys)] = keys
+        table = keys.reindex(columns=list(COLUMNS)).astype(object)
         table["recording"], table["piece"], table["status"] = piece.recording, numbers[piece.recording], placed.status
         numbers[piece.recording] += 1
         table["single_status"] = np.append(singles.status, "")[piece.query]
@@ -324,8 +318,8 @@ def _frames(
     alone = np.flatnonzero(~with_odometry)
     table = singles.keys.iloc[alone].assign(status=singles.status[alone], single_status=singles.status[alone])
     tables.append(table.reindex(columns=list(COLUMNS)))
-    all_poses = np.concatenate([*poses, singles.poses[alone]])
-    all_covariances = np.concatenate([*covariances, singles.covariances[alone]])
+    all_poses = np.concatenate([*poses, singles.results.world_from_rig[alone]])
+    all_covariances = np.concatenate([*covariances, singles.results.covariances[alone]])
     frames_table = pd.concat([part.astype(object) for part in tables], ignore_index=True)
     kept = (frames_table["status"] != "").to_numpy()  # online, only queries have a status
     frames_table, all_poses, all_covariances = frames_table[kept], all_poses[kept], all_covariances[kept]

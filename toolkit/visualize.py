@@ -1,7 +1,6 @@
 """The visualize stage: recordings and still pictures of a scene, from the files of earlier stages."""
 
 import re
-import time
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import product
@@ -14,13 +13,14 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, DamagedError
+from toolkit.figures.query_images import WorstQuery, draw_localization, draw_worst
 from toolkit.figures.sequences import SequencePair, draw_sequence
-from toolkit.figures.stills import WorstQuery, draw_localization, draw_scene, draw_worst
 from toolkit.figures.style import save_figure
+from toolkit.figures.top_view import draw_scene
 from toolkit.files import pair_name, require_current, sidecar_path, write_sidecar
 from toolkit.geometry import Floats
 from toolkit.manifest import VisualizeSettings
-from toolkit.results.images import LocalizedPair, support_of, sure_points
+from toolkit.results.localized import LocalizedPair, support_of, sure_points
 from toolkit.results.metrics import is_posed, worst_first
 from toolkit.runs.pairs import PairRows, left_out
 from toolkit.viewer.queries import record_localizations
@@ -79,17 +79,15 @@ def visualize_scene(
     ]
     if not chosen:
         raise ArtifactError(f"{poses_dir}: no poses of {capture.name} for the chosen devices. Localize them first.")
-    table, worst = PairRows(capture.name, out, Path(poses_dir)), []
-    sources: list[Path] = []
+    table, worst, sources = PairRows(capture.name, out, Path(poses_dir)), [], list[Path]()
     sheet = out / f"worst_{capture.name}.png"
     for path in (sheet, sidecar_path(sheet)):
         path.unlink(missing_ok=True)
     for m, q in tqdm(chosen, desc="visualize", unit="pair"):
         name = pair_name(capture.name, m, q)
-        _remove_pictures(out, name)  # those of an earlier run would look like results of this one
+        _remove_images(out, name)  # those of an earlier run would look like results of this one
         with table.row(m, q) as row:
             table.check_upstream()
-            started = time.perf_counter()
             of_pair = _poses(capture, poses_dir, m, q)
             require_current(of_pair, "localize", (".npz",), missing=False)
             pair = LocalizedPair.open(capture, m, q, poses_dir, map_dir)
@@ -101,21 +99,19 @@ def visualize_scene(
             row |= {
                 "queries": len(pair.results.table),
                 "localized": int(is_posed(pair.results.poses).sum()),
-                "seconds": round(time.perf_counter() - started, 3),
                 "still": str(out / f"{pair.name}.png"),
                 "recording": str(out / f"{pair.name}.rrd") if settings.recordings else "",
             }
             made_from = [of_pair, of_pair.with_suffix(".csv"), *([] if sequences is None else [sequences.path])]
             sources += made_from
-            write_sidecar(out / f"{name}.png", settings.model_dump(), _pictures(out, name)[1:], made_from=made_from)
+            write_sidecar(out / f"{name}.png", settings.model_dump(), _images(out, name)[1:], made_from=made_from)
         if row["reason"]:
-            _remove_pictures(out, name)
+            _remove_images(out, name)
     frame = table.frame()
     present = [(row["map_device"], row["query_device"]) for row in table.rows if not row["reason"]]
     _draw_worst(sheet, capture.name, pd.concat(worst, ignore_index=True))
     write_sidecar(sheet, settings.model_dump(), made_from=sources)
-    sides = dict.fromkeys((*((m, "map") for m, _ in present), *((q, "query") for _, q in present)))
-    for device, split in sides:
+    for device, split in dict.fromkeys((*((m, "map") for m, _ in present), *((q, "query") for _, q in present))):
         recording, poses = out / f"{capture.name}_{device}_{split}.rrd", None
         recording.unlink(missing_ok=True)
         if not settings.session_recordings:
@@ -126,8 +122,7 @@ def visualize_scene(
         if split == "query" and session.ground_truth is None:
             # Without ground truth, poses in the device's own map are the most accurate ones.
             localized_in = [m for m, q in present if q == device]
-            map_ = device if device in localized_in else localized_in[0]
-            poses = _poses(capture, poses_dir, map_, device)
+            poses = _poses(capture, poses_dir, device if device in localized_in else localized_in[0], device)
         record_session(
             *(capture.path, split, device),
             keyframes_only=listed,
@@ -152,14 +147,13 @@ def sample_pictures(out_dir: str | Path, name: str) -> list[Path]:
     return [found[k] for k in sorted(found)]
 
 
-def _remove_pictures(out: Path, name: str) -> None:
-    """Remove the pictures and the recording of a pair."""
-    for path in (*_pictures(out, name), sidecar_path(out / f"{name}.png")):
+def _remove_images(out: Path, name: str) -> None:
+    for path in (*_images(out, name), sidecar_path(out / f"{name}.png")):
         path.unlink(missing_ok=True)
 
 
-def _pictures(out: Path, name: str) -> list[Path]:
-    """Return the existing pictures and the recording of a pair, `<name>.png` first."""
+def _images(out: Path, name: str) -> list[Path]:
+    """Return the existing figures and the recording of a pair, `<name>.png` first."""
     paths = [*(out / f"{name}{end}" for end in (".png", "_sequence.png", ".rrd")), *sample_pictures(out, name)]
     return [path for path in paths if path.exists()]
 
@@ -167,7 +161,7 @@ def _pictures(out: Path, name: str) -> list[Path]:
 def _draw_pair(
     capture: Capture, pair: LocalizedPair, sequences: SequencePair | None, out: Path, settings: VisualizeSettings
 ) -> pd.DataFrame:
-    """Draw and record a pair; return its worst queries as rows of `LocalizedPair.table` with their details."""
+    """Draw and record a pair; return its worst queries as rows of `Localizations.errors` with their details."""
     m, q = pair.map_session.device, pair.query_session.device
     shown, cloud, map_poses = pair.localizations, sure_points(pair.local_map), pair.map_session.world_from_cam()
     details_of = lru_cache(2 * WORST)(pair.details)  # the worst queries are needed for the sheet and the recording
@@ -177,30 +171,27 @@ def _draw_pair(
         title=f"{q} queries in the {m} map, seen from above",
         map_tracks=session_tracks(pair.map_session),
         query_tracks=session_tracks(pair.query_session),
-        unit=pair.results.unit,
+        unit=shown.unit,
     )
     save_figure(figure, out / f"{pair.name}.png", figure.get_suptitle())
-    order = worst_first(pair.table).tolist()
+    order = worst_first(shown.errors).tolist()
     chosen = np.unique(np.linspace(0, len(order) - 1, min(settings.samples, len(order))).round().astype(int))
     for number, k in enumerate((order[rank] for rank in chosen), start=1):
-        title = f"{q} query in the {m} map: {pair.results.table['status'].iloc[k]}"
-        figure = draw_localization(details_of(k), title, pair.results.unit)
+        title = f"{q} query in the {m} map: {shown.errors['status'].iloc[k]}"
+        figure = draw_localization(details_of(k), title, shown.unit)
         save_figure(figure, out / f"localization_{pair.name}_{number}.png", figure.get_suptitle())
     tracks: dict[str, list[Floats]] = {}
     if sequences is not None:
-        figure = draw_sequence(capture, sequences, m, q, settings.world_up, pair.results.unit)
+        figure = draw_sequence(capture, sequences, m, q, settings.world_up, shown.unit)
         save_figure(figure, out / f"{pair.name}_sequence.png")
         tracks = {"odometry": sequences.odometry_tracks(pair.query_session), "frames": sequences.tracks()}
     if settings.recordings:
         details = ((k, details_of(k)) for k in sorted(order[: settings.matched_queries]))
-        record_localizations(
-            *(out / f"{pair.name}.rrd", pair.name, map_poses, *cloud, shown, details),
-            up=settings.world_up,
-            tracks=tracks,
-        )
+        where = (out / f"{pair.name}.rrd", pair.name, map_poses, *cloud)
+        record_localizations(*where, shown, details, up=settings.world_up, tracks=tracks)
     worst = order[:WORST]
-    rows = pair.table.iloc[worst]
-    return rows.assign(unit=pair.results.unit[0], pair=f"{q} in the {m} map", details=[details_of(k) for k in worst])
+    more = {"unit": shown.unit[0], "pair": f"{q} in the {m} map", "details": [details_of(k) for k in worst]}
+    return shown.errors.iloc[worst].assign(**more)
 
 
 def _poses(capture: Capture, poses_dir: str | Path, map_device: str, query_device: str) -> Path:
@@ -211,10 +202,10 @@ def _draw_worst(path: Path, scene: str, candidates: pd.DataFrame) -> None:
     """Draw the worst queries of all pairs; `candidates` are the rows of `_draw_pair`."""
     shown = []
     for _, row in candidates.iloc[worst_first(candidates)[:WORST]].iterrows():
-        reason = [row["status"]]
-        if row["details"].has_matches and pd.notna(row.get("num_matches")):
+        has_matches, reason = row["details"].has_matches, [row["status"]]
+        if has_matches and pd.notna(row.get("num_matches")):
             reason.append(f"{row['num_matches']:.0f} matches")
-        if row["details"].has_matches or row.get("num_inliers", 0) > 0:
+        if has_matches or row.get("num_inliers", 0) > 0:
             reason.append(support_of(row))
         errors = row["rotation_error_deg"], row["translation_error_m"]
         shown.append(WorstQuery(row["pair"], ", ".join(reason), row["details"], *errors, row["unit"]))

@@ -15,10 +15,17 @@ from tests.localized import some_correspondences, stored, write_pair
 from tests.rendered import LIST, copy_shared, write_retrieval
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, ManifestError
-from toolkit.figures.answers import reason_in_words
-from toolkit.figures.choice import Choice, choose, find_query, shown_name
-from toolkit.figures.inspection import Comparison, InspectedPair, WorstQueries, inspect_query
-from toolkit.figures.inspection_view import _position_covariance
+from toolkit.figures.answers import _position_covariance, reason_in_words
+from toolkit.figures.inspection import (
+    Choice,
+    Comparison,
+    InspectedPair,
+    WorstQueries,
+    choose,
+    find_query,
+    inspect_query,
+)
+from toolkit.figures.query_images import shown_name
 from toolkit.files import SceneFiles, map_record_path
 from toolkit.geometry import invert
 from toolkit.localize import localize_pairs

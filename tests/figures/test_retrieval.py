@@ -12,8 +12,7 @@ from tests.rendered import copy_shared
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError
 from toolkit.figures.retrieval import RetrievedPair
-from toolkit.results.metrics import is_posed
-from toolkit.results.overlap import LEAST_OVERLAP
+from toolkit.results.metrics import MIN_OVERLAP, is_posed
 from toolkit.retrieve import retrieve_pairs
 
 
@@ -48,13 +47,13 @@ def test_green_is_what_looks_the_same_way(pair: RetrievedPair) -> None:
     one = pair.look(pair.names.index(session.image_name(0)))
     assert one.is_known
     directions = pair.map_session.world_from_cam(one.images)[:, :3, 2] @ true[:3, 2]
-    assert (one.overlap[directions < -0.8] < LEAST_OVERLAP).all()
+    assert (one.overlap[directions < -0.8] < MIN_OVERLAP).all()
     assert one.overlap[np.argmax(directions)] > 0.3
     frames = [axis for axis in one.figure.axes if axis.get_title().startswith(tuple("1234"))]
     for axis, hit in zip(frames, one.references.itertuples(), strict=True):
         assert axis.get_title().startswith(f"{hit.rank}: {hit.score:.2f}, overlap {hit.overlap:.0%}")
         color = axis.spines["top"].get_edgecolor()
-        assert (color[1] > color[0]) == (hit.overlap >= LEAST_OVERLAP)
+        assert (color[1] > color[0]) == (hit.overlap >= MIN_OVERLAP)
     assert picture_of(one).width > 800
 
 

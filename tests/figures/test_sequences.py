@@ -183,4 +183,4 @@ def test_recordings_from_above(place: Path, tmp_path: Path) -> None:
     assert any(text.startswith("rescued: ") for text in texts)
     steps = pd.DataFrame(pair.recalls(session.keyframes(), truth, LIMITS, "m", 1.0))
     figure = draw_steps(steps.assign(map_device="ios", query_device="ios"))
-    assert [axis.get_title() for axis in figure.axes] == ["recall @ 1°, 0.1 m", "recall @ 5°, 0.5 m"]
+    assert [axis.get_title() for axis in figure.axes] == ["recall @ 1°, 0.1\xa0m", "recall @ 5°, 0.5\xa0m"]

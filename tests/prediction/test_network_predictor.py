@@ -1,6 +1,7 @@
 """VGGT as a predictor: groups, batches, the cache, memory and bad images, with a small network of its kind."""
 
 import logging
+import threading
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -324,6 +325,52 @@ def test_bfloat16_is_near_and_keeps_half_as_much(make: Make, photographs: Photog
     error = np.abs(found.model_from_cams - expected.model_from_cams).max()
     assert 1e-6 < error < 0.1
     assert_same(again, found)
+
+
+def test_the_next_call_is_decoded_while_the_network_runs(
+    make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The network waits here until all that the next call needs has been read; one map image is encoded already."""
+    shared = photographs.view()
+    first, second = ([photographs.view(in_map=False), photographs.view(), shared] for _ in range(2))
+    expected = make(cache_bytes=0).predict([first, second])
+    read, begun, done = NetworkPredictor._read, list[Path](), threading.Semaphore(0)
+
+    def reads(predictor: NetworkPredictor, placed: Any) -> Any:
+        begun.append(placed.view.image)
+        image = read(predictor, placed)
+        if placed.view in second[:2]:
+            done.release()
+        return image
+
+    monkeypatch.setattr(NetworkPredictor, "_read", reads)
+    predictor = make()
+    forward = predictor._model.forward
+
+    def waits(*arguments: Any) -> Any:
+        assert len(begun) > 5 or (done.acquire(timeout=20) and done.acquire(timeout=20))
+        return forward(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(predictor._model, "forward", waits)
+        [found] = predictor.predict([first], [second])
+    assert_same(found, expected[0])
+    for view in second[:2]:
+        view.image.unlink()
+    [found] = predictor.predict([second])
+    assert_same(found, expected[1])
+    assert sorted(begun) == sorted(view.image for view in [*first, *second[:2]]), "each once"
+    assert not predictor._begun
+
+
+def test_what_was_decoded_in_vain_is_forgotten(make: Make, photographs: Photographs) -> None:
+    one, other = photographs.group(WIDE, WIDE), photographs.group(WIDE, WIDE)
+    predictor = make()
+    expected = predictor.predict([one])
+    assert_same(predictor.predict([one], [other])[0], expected[0])
+    assert len(predictor._begun) == 2
+    assert_same(predictor.predict([one])[0], expected[0])
+    assert not predictor._begun
 
 
 # Memory

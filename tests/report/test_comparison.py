@@ -21,8 +21,9 @@ def write_run(folder: Path, errors: dict[tuple[str, str], list[tuple[float, floa
     files = SceneFiles(folder, "PLACE")
     files.evaluation.mkdir(parents=True)
     rows = [
-        {"map_device": m, "query_device": q, "timestamp": k, "device_id": f"00{k}", "status": "ok" if error[0] < 9 else
-         "failed: too few matches", "num_inliers": 9, "rotation_error_deg": error[0], "translation_error_m": error[1]}
+        {"map_device": m, "query_device": q, "timestamp": k, "device_id": f"00{k}", "image": f"{k}.jpg",
+         "status": "ok" if error[0] < 9 else "failed: too few matches", "num_inliers": 9,
+         "rotation_error_deg": error[0], "translation_error_m": error[1]}
         for (m, q), of_pair in errors.items() for k, error in enumerate(of_pair)
     ]  # fmt: skip
     columns = {f"loss@{name}": "" for name in LIMITS}
@@ -111,7 +112,7 @@ def test_queries_have_the_names_of_their_images(two: list[Path]) -> None:
     for run in two:
         table = run / "PLACE" / "evaluation" / "errors.csv"
         errors = pd.read_csv(table, dtype={"device_id": str})
-        errors.insert(2, "image", [f"walk/{'long/' * 20}{k}.jpg" for k in errors["timestamp"]])
+        errors["image"] = [f"walk/{'long/' * 20}{k}.jpg" for k in errors["timestamp"]]
         errors.to_csv(table, index=False)
         write_sidecar(table.with_name("recall.csv"), {}, [table])
     comparison = compare_runs(two)

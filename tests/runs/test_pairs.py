@@ -21,10 +21,10 @@ def test_a_pair_that_cannot_be_done_is_a_row_with_the_reason(tmp_path: Path) -> 
     with table.row("ios", "hl"):
         raise CaptureError("images.txt, line 3: a dragon.")
     with table.row("ios", "ios") as row:
-        row |= {"queries": 3, "seconds": 0.1, "skipped": True, "path": "x"}
+        row |= {"queries": 3, "path": "x", "skipped": True, "seconds": 100.0}
     frame = table.frame()
     assert frame.to_dict("list") == {
-        "map_device": ["ios", "ios"], "query_device": ["hl", "ios"], "queries": [0, 3], "seconds": [0.0, 0.1],
+        "map_device": ["ios", "ios"], "query_device": ["hl", "ios"], "queries": [0, 3], "seconds": [0.0, 100.0],
         "skipped": [False, True], "path": ["", "x"], "reason": ["images.txt, line 3: a dragon.", ""],
     }  # fmt: skip
     (lost,) = left_out_of(frame)

@@ -25,6 +25,14 @@ def test_a_run_has_its_settings_maps_and_queries(small_run: Path, released_weigh
     assert set(of_device["status"]) == set(
         pd.concat([table for stem, table in tables.items() if f"_map_{device}_query_" in stem])["status"]
     )
+    row = of_device.iloc[-1]
+    name, *others = row["image"].split(";")
+    query = run[name]
+    folder = run.map(device).capture[f"{row['query_device']}_query"].path / "raw_data"
+    assert {view.image for view in query.views} == {folder / image for image in (name, *others)}
+    assert run.map(device).locate(query).status == row["status"].partition(":")[0]
+    with pytest.raises(ArtifactError, match=r"0 query images with the name 'nowhere.jpg'"):
+        run["nowhere.jpg"]
 
 
 def test_what_is_no_run_names_those_beside_it(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Recordings read back: they hold the frames, poses and queries that the files say, and nothing else."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from toolkit.capture import Capture, Trajectory, write_depth, write_session
 from toolkit.errors import ArtifactError, CaptureError
 from toolkit.geometry import make_pose, quaternion_to_rotation
 from toolkit.mapping.local_map import LocalMap
-from toolkit.results.images import Localizations, QueryDetails, ShownImage
+from toolkit.results.localized import Localizations, QueryDetails, ShownImage
 from toolkit.viewer.blueprint import scene_view, shown_intrinsics, small_jpeg, spawn_viewer
 from toolkit.viewer.queries import record_localizations
 from toolkit.viewer.sessions import record_session, session_tracks
@@ -288,8 +289,7 @@ def test_a_localization_view_holds_the_queries(capture, tmp_path, monkeypatch):
     references = np.full((4, 3), np.nan)
     references[2] = [7, 8, 9]
     errors = {"rotation_error_deg": [0, 0, np.inf, np.nan], "translation_error_m": [0, 0.5, np.inf, np.nan]}
-    statuses = ["ok", "ok", "failed: dark", "ok"]
-    table = pd.DataFrame({"status": statuses, "num_inliers": [9, 8, 0, 7], **errors})
+    table = pd.DataFrame({"status": ["ok", "ok", "failed: dark", "ok"], "num_inliers": [9, 8, 0, 7], **errors})
     queries = Localizations(list("abcd"), table, estimated, true, references)
     points = rng.uniform([-0.3, -0.3, 2], [0.3, 0.3, 4], (6, 3))
     pixels = rng.uniform(0, 90, (6, 2))
@@ -345,16 +345,23 @@ def test_a_world_far_from_its_origin_is_shown_without_jitter(small_capture: Path
     file = Capture.open(small_capture)["ios_map"].image_path(0)
     correspondences = np.ones((2, 2)), poses[:2, :3, 3], np.arange(2), np.ones(2, bool)
     shown = ShownImage("b.jpg", file, camera, poses[1], *correspondences)
-    errors = {"rotation_error_deg": [0, np.inf], "translation_error_m": [0, np.inf]}
+    errors = {"rotation_error_deg": [1, np.inf], "translation_error_m": [0.2, np.inf]}
     table = pd.DataFrame({"status": ["ok", "failed: dark"], "num_inliers": [9, 0], **errors})
     estimated = np.stack([poses[1], np.full((4, 4), np.nan)])
     queries = Localizations(["a", "b"], table, estimated, poses[:2], poses[:2, :3, 3])
     views = []
     for name, shift, capture in (("near", np.zeros(3), small_capture), ("far", offset, far)):
-        moved = [(0, QueryDetails([shown], [shown]).shifted(shift))]
+        at = {"world_from_cam": geometry.shifted(poses[1], shift), "points": shown.points + shift}
+        image = replace(shown, **at)
+        moved = replace(
+            queries,
+            estimated=geometry.shifted(estimated, shift),
+            true=geometry.shifted(poses[:2], shift),
+            nearest_reference=poses[:2, :3, 3] + shift,
+        )
         record_localizations(
             *(tmp_path / f"{name}.rrd", "view", geometry.shifted(poses, shift), poses[:, :3, 3] + shift, None),
-            *(queries.shifted(shift), moved),
+            *(moved, [(0, QueryDetails([image], [image]))]),
             up=[0, 0, 1],
             tracks={"frames": [poses[:, :3, 3] + shift]},
         )
@@ -373,7 +380,8 @@ def test_a_world_far_from_its_origin_is_shown_without_jitter(small_capture: Path
 
 def test_a_view_without_queries_points_or_map(tmp_path):
     none = np.zeros((0, 4, 4))
-    queries = Localizations([], pd.DataFrame({"status": [], "translation_error_m": []}), none, none)
+    errors = pd.DataFrame(columns=["status", "rotation_error_deg", "translation_error_m"])
+    queries = Localizations([], errors, none, none)
     assert record_localizations(tmp_path / "e.rrd", "e", none, np.zeros((0, 3)), None, queries).stat().st_size > 0
 
 

@@ -199,7 +199,7 @@ def _answers(
     rows = poses.index.find(keyframes["timestamp"].to_numpy(np.int64), keyframes["device_id"])
     statuses, nearest, why_not = dict[Key, str](), dict[Key, Floats](), "not localized"
     if path.with_suffix(".csv").is_file():
-        run_table = PairResults.open(path).table
+        run_table = PairResults.open(path, whole=False).table
         statuses = {(row.timestamp, row.device_id): row.status for row in run_table.itertuples()}
     if failed == "nearest" and np.any(rows < 0):
         require_current(files.poses_txt(*pair), "localize", (".jsonl",), missing=False)

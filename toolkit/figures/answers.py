@@ -1,20 +1,28 @@
-"""The result of localizing one query: status in words, numbers, correspondences, pose and rivals."""
+"""One localized query: its status in words, numbers, correspondences, pose and rivals, and a figure of them."""
 
-from collections.abc import Mapping
+import textwrap
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from toolkit.figures.style import number
-from toolkit.geometry import Floats
+from toolkit.figures.query_images import PURPLE, draw_image, draw_joined, draw_matches, style_of
+from toolkit.figures.style import BLUE, ESTIMATED, GRAY, MAP, ORANGE, TRUE, new_figure, number, styled
+from toolkit.figures.top_view import Ground, Layer, Places, draw_layers, window_of
+from toolkit.geometry import Floats, shifted
 from toolkit.manifest import LocalizeSettings
 from toolkit.pose.confidence import bounded_by_rivals
 from toolkit.pose.result import CAMERA, QueryResult, Status
-from toolkit.results.images import LocalizedPair, QueryDetails
+from toolkit.results.localized import LocalizedPair, QueryDetails, sure_points
 from toolkit.results.metrics import is_posed, pose_errors
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
 
 LABELS = {
     "num_matches": ("descriptor matches", "{:.0f}"), "num_inliers": ("inliers among them", "{:.0f}"),
@@ -24,8 +32,7 @@ LABELS = {
     "agreement": ("matches of a second kind", "{:.0f}"), "position_std_m": ("std. dev. of position [{unit}]", "{:.2g}"),
     "rotation_std_deg": ("std. dev. of rotation [deg]", "{:.2g}"), "scale_std": ("std. dev. of scale", "{:.1%}"),
 }  # fmt: skip
-"""Numbers about a pose, columns of a pair's table and attributes of an estimate: label and format of each; `{unit}`
-stands for the pair's unit of length."""
+"""Numbers about a pose, attributes of a result: label and format of each; `{unit}` stands for the unit of lengths."""
 OF_NETWORKS = {
     "num_matches": ("references given to it", "{:.0f}"), "num_inliers": ("consistent ones", "{:.0f}"),
     "inlier_ratio": ("their share", "{:.0%}"),
@@ -33,6 +40,13 @@ OF_NETWORKS = {
 """Labels and formats that differ for poses of a feed-forward network."""
 OF_MATCHES = ("num_guided", "rmse_px", "coverage", "p_correct", "rival_support", "agreement")
 """Numbers that a pose without matches does not have."""
+SURE = 2.4477
+"""Radius of the 95 % region of a 2D normal distribution, standard deviations."""
+MAX_POINTS = 20_000
+NAMES, COLORS = ("as it was", "again"), (ESTIMATED, PURPLE)
+"""Of the answers in a figure; a single answer is called `estimated`."""
+BELOW: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16), "ncols": 2, "fontsize": 7.5}
+"""Legend below a panel."""
 
 
 @dataclass(frozen=True)
@@ -72,47 +86,34 @@ class Answer:
         return reason_in_words(self.result, self.numbers, self.settings)
 
     @property
-    def caption(self) -> str:
-        """What the drawn image and its best reference see."""
-        camera, references = self.details.cameras[0], self.details.captioned_references()
-        of_rig = f" ({folder_of(camera.name)})" if len(self.details.cameras) > 1 else ""
-        counts = f"{camera.num_inliers} of {len(camera.matches)} map points agree"
-        text = f"query{of_rig}: {counts if len(camera.matches) else 'no matches were stored'}"
-        if not references:
-            return f"{text} · no reference"
-        both = np.isin(camera.matches, references[0][0].matches)
-        joined = f", {int(camera.inlier[both].sum())} of this image" if both.any() else ""
-        return f"{text} · {references[0][1]}{joined}"
-
-    @property
     def texts(self) -> dict[str, str]:
         """The known numbers, errors and seconds as texts by their label."""
-        by_network, unit = _is_by_network(self.result.found_by), self.pair.results.unit[0]
-        labels = LABELS | OF_NETWORKS if by_network else LABELS
+        by_network, unit, numbers = _is_by_network(self.result.found_by), self.pair.results.unit[0], self.numbers
         hidden = set(OF_MATCHES) if by_network else set[str]()
-        if self.result.world_from_rig is not None and not self.numbers.get("num_matches"):
+        if self.result.world_from_rig is not None and not numbers.get("num_matches"):
             hidden = {*OF_MATCHES, *OF_NETWORKS}
-        if not self.numbers.get("agreement"):
+        if not numbers.get("agreement"):
             hidden.add("agreement")
-        shown = {name: each for name, each in labels.items() if name in self.numbers and name not in hidden}
-        texts = {label.format(unit=unit): form.format(self.numbers[name]) for name, (label, form) in shown.items()}
-        texts = {"method": self.result.found_by, **texts}
+        texts = {"method": self.result.found_by}
+        for name, (label, form) in (LABELS | OF_NETWORKS if by_network else LABELS).items():
+            if name in numbers and name not in hidden:
+                texts[label.format(unit=unit)] = form.format(numbers[name])
         if self.error is not None:
             texts[f"true position error [{unit}]"] = _digits(self.error[1])
             texts["true rotation error [deg]"] = _digits(self.error[0])
         return {**texts, "seconds": f"{self.result.seconds:.2f}"}
 
-    @property
-    def rig_from_cam(self) -> Floats:
-        """Pose of the drawn image, (4, 4)."""
-        session, rows = self.pair.query_session, self.pair.rows[self.number]
-        names = [session.image_name(int(row)) for row in rows]
-        return np.asarray(session.rig_from_cam(rows)[names.index(self.details.cameras[0].name)])
-
     @cached_property
     def details(self) -> QueryDetails:
         """Its images and references, with their correspondences."""
         return self.pair.details(self.number, self.result)
+
+    @property
+    def rig_from_cam(self) -> Floats:
+        """Pose of the first image of the `details`, (4, 4)."""
+        session, rows = self.pair.query_session, self.pair.rows[self.number]
+        names = [session.image_name(int(row)) for row in rows]
+        return np.asarray(session.rig_from_cam(rows)[names.index(self.details.cameras[0].name)])
 
     @property
     def true_pose(self) -> Floats | None:
@@ -145,15 +146,12 @@ class Answer:
         that agree with the pose and that it observes; missing if its views were not stored).
         """
         retrieved, matches, used = self.retrieved, self.result.correspondences, self.result.references
-        names = list(dict.fromkeys([*used, *self.result.rejected, *retrieved]))
-        kept = set(matches.view_reference.tolist())
-        rows = []
-        for name in names:
-            rank, score = retrieved.get(name, (None, np.nan))
-            number = used.index(name) if name in used else -1
-            seen = matches.view_of[matches.view_reference == number]
-            shared = int(matches.inlier[seen].sum()) if number in kept else None
-            rows.append((name, rank, score, name in used, name in self.result.rejected, shared))
+        kept, rows = set(matches.view_reference.tolist()), []
+        for name in dict.fromkeys([*used, *self.result.rejected, *retrieved]):
+            at = used.index(name) if name in used else -1
+            shared = int(matches.inlier[matches.view_of[matches.view_reference == at]].sum()) if at in kept else None
+            of_retrieval = retrieved.get(name, (None, np.nan))
+            rows.append((name, *of_retrieval, name in used, name in self.result.rejected, shared))
         table = pd.DataFrame(rows, columns=["name", "rank", "score", "used", "rejected", "shared"])
         return table.astype({"rank": "Int64", "shared": "Int64"})
 
@@ -161,9 +159,7 @@ class Answer:
         return f"{self.headline}\n{self.name}\n{self.reason}"
 
 
-def folder_of(name: str) -> str:
-    """Return the name of an image's folder, which tells the camera of a rig."""
-    return Path(name).parent.name
+# In words
 
 
 def _is_by_network(method: str) -> bool:
@@ -184,38 +180,38 @@ def reason_in_words(result: QueryResult, numbers: Mapping[str, float], settings:
         settings: settings of the localization, which hold the limits.
     """
     detail, method = result.reason, result.found_by
-    more = f" {result.remark[0].upper()}{result.remark[1:]}." if result.remark else ""
     if result.status is Status.FAILED:
-        return _why_failed(detail, numbers, settings) + more
-    if detail == CAMERA:
-        return "The matches contradict the camera's intrinsics." + more
-    if detail:
-        return f"{detail[0].upper()}{detail[1:]}.{more}"
-    if settings.method == "nearest":
-        return "This is the unchanged pose of the best reference, which is never called ok." + more
-    if result.status is Status.LOW_CONFIDENCE:
-        return " ".join([*_doubts(numbers, settings), *_support(numbers, method)]) + more
-    return " ".join(_support(numbers, method)) + more
+        said = [_why_failed(detail, int(numbers.get("num_matches", 0)), settings.pnp.min_inliers)]
+    elif detail == CAMERA:
+        said = ["The matches contradict the camera's intrinsics."]
+    elif detail:
+        said = [f"{detail[0].upper()}{detail[1:]}."]
+    elif settings.method == "nearest":
+        said = ["This is the unchanged pose of the best reference, which is never called ok."]
+    else:
+        in_doubt = result.status is Status.LOW_CONFIDENCE
+        said = [*(_doubts(numbers, settings) if in_doubt else ()), *_support(numbers, method)]
+    remark = [f"{result.remark[0].upper()}{result.remark[1:]}."] if result.remark else []
+    return " ".join([*said, *remark])
 
 
-def _why_failed(detail: str, numbers: Mapping[str, float], settings: LocalizeSettings) -> str:
-    count = int(numbers.get("num_matches", 0))
+def _why_failed(detail: str, count: int, min_inliers: int) -> str:
     sentences = {
         "too few matches": f"{count} matches with the map are too few to compute one",
         "no consistent pose": f"too few of {count} matches agree on any pose",
         "no references": "the retrieval has no references for this query",
     }
     if detail.startswith("too few inliers"):
-        return f"No pose: {detail} among {count} matches; at least {settings.pnp.min_inliers} are required."
+        return f"No pose: {detail} among {count} matches; at least {min_inliers} are required."
     return f"No pose: {sentences.get(detail, detail)}."
 
 
 def _doubts(numbers: Mapping[str, float], settings: LocalizeSettings) -> list[str]:
-    doubts, limits = [], settings.pnp
+    doubts, least = [], settings.pnp.ok_probability
     probability, rival = numbers.get("p_correct", np.nan), numbers.get("rival_support", 0.0)
-    if probability < limits.ok_probability:
-        doubts.append(f"It is right with a probability of {probability:.0%}; ok requires {limits.ok_probability:.0%}.")
-    if bounded_by_rivals(1.0, [rival]) < limits.ok_probability:
+    if probability < least:
+        doubts.append(f"It is right with a probability of {probability:.0%}; ok requires {least:.0%}.")
+    if bounded_by_rivals(1.0, [rival]) < least:
         doubts.append(f"Another pose has {rival:.0%} of its support, so it may be the right one.")
     return doubts or ["It has too little support to be trusted."]
 
@@ -223,11 +219,200 @@ def _doubts(numbers: Mapping[str, float], settings: LocalizeSettings) -> list[st
 def _support(numbers: Mapping[str, float], method: str) -> list[str]:
     if not numbers.get("num_matches"):
         return ["The pose comes from the references as a whole, not from matches."]
+    counts = f"{numbers['num_inliers']:.0f} of {numbers['num_matches']:.0f}"
     if _is_by_network(method):
-        return [f"{numbers['num_inliers']:.0f} of {numbers['num_matches']:.0f} references agree on the pose."]
-    share, coverage = numbers.get("inlier_ratio", np.nan), numbers.get("coverage", np.nan)
-    text = f"{numbers['num_inliers']:.0f} of {numbers['num_matches']:.0f} matches agree on the pose ({share:.0%})"
-    parts = [text + (f", in {coverage:.0%} of the image." if coverage > 0 else ".")]
-    rival = numbers.get("rival_support", 0.0)
-    parts.append(f"The best other pose has {rival:.0%} of its support." if rival else "No other pose was found.")
-    return parts
+        return [f"{counts} references agree on the pose."]
+    text = f"{counts} matches agree on the pose ({numbers.get('inlier_ratio', np.nan):.0%})"
+    coverage, rival = numbers.get("coverage", np.nan), numbers.get("rival_support", 0.0)
+    best = f"The best other pose has {rival:.0%} of its support." if rival else "No other pose was found."
+    return [text + (f", in {coverage:.0%} of the image." if coverage > 0 else "."), best]
+
+
+# As a figure
+
+
+@styled
+def draw_answers(answers: Sequence[Answer], title: str) -> "Figure":
+    """Draw a query, localized once or twice: beside its best reference, in the map from above, and in numbers.
+
+    Lines join the points that the query and its best reference both see. Inliers are colored by how they were found
+    (`query_images.WAYS`), rejected matches are red; markers tell the kind of features. A single answer also has its
+    further references.
+    """
+    several = len(answers) > 1
+    heights = [3.3, 3.6] if several else [4.0, 2.0, 3.6]
+    figure = new_figure(11, sum(heights) - 0.1)
+    above, *strip, below = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for axis, answer, name in zip(above.subplots(1, len(answers), squeeze=False)[0], answers, NAMES, strict=False):
+        draw_joined(axis, answer.details, 3.3, by_kind=True)
+        axis.set_axis_off()
+        of_answer = f"{name}: {answer.result.status_text}\n{textwrap.fill(answer.reason, 78)}"
+        axis.set_title(of_answer if several else _caption(answer.details), fontsize=8.5)
+        for agrees, column in ((True, "agree"), (False, "rejected")):
+            for kind, count in answer.matches[column][answer.matches[column] > 0].items():
+                label = f"{str(kind).replace('/', ', ')}: {count} {column}"
+                axis.plot([], [], ls="", ms=5, label=label, **style_of(str(kind), agrees))
+        if len(answer.matches):
+            columns = 3 if several else 6
+            axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=columns, fontsize=7.5)
+    for part in strip:
+        _draw_further(part, answers[0].details)
+    from_above, near, table = below.subplots(1, 3, width_ratios=[1.0, 0.9, 1.0 + 0.25 * several])
+    _draw_from_above(from_above, answers)
+    _draw_near(near, answers)
+    _draw_table(table, answers)
+    figure.suptitle(title, fontsize=10)
+    return figure
+
+
+def _caption(details: QueryDetails) -> str:
+    """Return what the drawn image and its best reference see."""
+    camera, references = details.cameras[0], details.captioned_references()
+    of_rig = f" ({Path(camera.name).parent.name})" if len(details.cameras) > 1 else ""
+    counts = f"{camera.num_inliers} of {len(camera.matches)} map points agree"
+    text = f"query{of_rig}: {counts if len(camera.matches) else 'no matches were stored'}"
+    if not references:
+        return f"{text} · no reference"
+    both = np.isin(camera.matches, references[0][0].matches)
+    joined = f", {int(camera.inlier[both].sum())} of this image" if both.any() else ""
+    return f"{text} · {references[0][1]}{joined}"
+
+
+def _draw_further(figure: "SubFigure", details: QueryDetails) -> None:
+    """Draw the references but the best, and the further cameras of a rig."""
+    images = details.captioned_references()[1:]
+    for image in details.cameras[1:]:
+        count = f": {image.num_inliers} points agree" if details.has_matches else ""
+        images.append((image, f"query, {Path(image.name).parent.name}{count}", True))
+    panels = figure.subplots(1, max(4, min(6, len(images))), squeeze=False)[0]
+    for panel in panels:
+        panel.set_axis_off()
+    for panel, (image, text, agrees) in zip(panels, images, strict=False):
+        inches = 2.4 / max(1.0, image.ratio)
+        draw_image(panel, image, inches, textwrap.fill(text, 30), "black" if agrees else ESTIMATED)
+        draw_matches(panel, image, 4, by_kind=True)
+
+
+def _ground_and_cameras(answer: Answer) -> tuple[Ground, Floats]:
+    """Return the ground of the map, and the poses of its cameras (N, 4, 4)."""
+    poses = answer.pair.map_session.world_from_cam()
+    poses = poses[is_posed(poses)]
+    return Ground.below(poses, answer.settings.world_up, answer.pair.results.unit), poses
+
+
+def _cameras_of(answers: Sequence[Answer]) -> list[tuple[Floats, str, str]]:
+    """Return world_from_cam, label and color of the answers with a pose, and of the ground truth if known."""
+    # A rig is shown by the camera that the first answer draws.
+    rig_from_cam, true = answers[0].rig_from_cam, answers[0].true_pose
+    names = NAMES if len(answers) > 1 else ("estimated",)
+    estimated = (answer.result.world_from_rig for answer in answers)
+    poses = [*zip(estimated, names, COLORS, strict=False), (true, "true", TRUE)]
+    return [(pose @ rig_from_cam, name, color) for pose, name, color in poses if pose is not None]
+
+
+def _dot(pose: Floats, name: str, color: str, heading: float = 0.0) -> Layer:
+    """Return the layer of one camera; the ground truth is a ring, so that a dot inside stays visible."""
+    true = color == TRUE
+    return Layer(pose[None], name, color, heading, hollow=true, s=70 if true else 32, lw=1.3, zorder=5)
+
+
+def _draw_from_above(axis: "Axes", answers: Sequence[Answer]) -> None:
+    """Draw the place of the map around the query from above: map points, cameras, references, poses, rivals, truth."""
+    answer = answers[0]
+    ground, cameras = _ground_and_cameras(answer)
+    points = sure_points(answer.pair.local_map)[0]
+    points = points[:: len(points) // MAX_POINTS + 1]
+    references = np.array([image.world_from_cam for image in answer.details.references]).reshape(-1, 4, 4)
+    references = references[is_posed(references)]
+    shown, named = _cameras_of(answers), list[tuple[Floats, str, Layer]]()
+    for rival in answers[-1].result.rivals:
+        pose, label = rival.world_from_rig @ answer.rig_from_cam, f"rival, {rival.support:.0%} of the support"
+        diamond = Layer(pose[None], label, BLUE, 0.08, hollow=True, s=40, marker="D")
+        named.append((pose, f"rival ({rival.support:.0%})", diamond))
+    named += [(pose, name, _dot(pose, name, color, 0.12)) for pose, name, color in shown]
+    layers = [
+        Layer(points, None, "0.75", s=1, lw=0, rasterized=True),
+        Layer(cameras, "map cameras", MAP, s=7, lw=0),
+        Layer(references, "references", ORANGE, 0.08, s=16, lw=0),
+        *(layer for _, _, layer in named),
+    ]
+    centers = ground.flat(np.array([pose for pose, _, _ in named]).reshape(-1, 4, 4))
+    places, of_references = Places(ground.flat(cameras)), ground.flat(references)
+    anchor = np.concatenate([ground.flat(pose[None]) for pose, _, _ in shown[:1]] + [of_references])[:1]
+    contents = places.cameras
+    if len(anchor):
+        contents = places.contents(int(places.nearest(anchor)[0]), ground.flat(points), anchor[:0])
+    contents = np.concatenate([contents, of_references])
+    # What lies farther away than the map is large is named, not drawn.
+    low, high = window_of(contents, margin=1.0)
+    window = window_of(np.concatenate([contents, centers[((centers > low) & (centers < high)).all(axis=1)]]))
+    axis.scatter([], [], s=9, c="0.75", lw=0, label="map points")  # a larger dot for the legend
+    draw_layers(axis, ground, layers, window)
+    outside = ((centers < window[0]) | (centers > window[1])).any(axis=1)
+    names = ", ".join(name for (_, name, _), far in zip(named, outside, strict=True) if far)
+    axis.set_title("from above" + (f"\noutside the picture: {names}" if names else ""), fontsize=9)
+    axis.legend(**BELOW)
+
+
+def _draw_near(axis: "Axes", answers: Sequence[Answer]) -> None:
+    """Draw the positions of the answers and the truth, enlarged to show the uncertainty."""
+    from matplotlib.patches import Ellipse
+
+    posed = [answer for answer in answers if answer.result.world_from_rig is not None]
+    if not posed:
+        axis.set_axis_off()
+        axis.text(0.5, 0.5, "no pose", ha="center", va="center", color=GRAY)
+        return
+    unit, length = posed[0].pair.results.unit
+    ground, shown = _ground_and_cameras(posed[0])[0], _cameras_of(answers)
+    origin = -shown[0][0][:3, 3]
+    shown = [(shifted(pose, origin), name, color) for pose, name, color in shown]
+    ellipses, reach = [], [float(np.abs(ground.flat(pose)).max()) for pose, _, _ in shown]
+    for of_answer, answer in zip(shown, posed, strict=False):  # the truth is shown last
+        if answer.result.covariance is not None:
+            spread = ground.axes @ _position_covariance(answer, answers[0].rig_from_cam) @ ground.axes.T
+            values, vectors = np.linalg.eigh(spread)
+            sizes = 2 * SURE * np.sqrt(np.maximum(values, 0)) / length
+            reach.append(float(sizes.max()) * 0.55)
+            ellipses.append((of_answer, sizes, float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))))
+    half = 1.35 * max([value for value in reach if np.isfinite(value)], default=0.0) or 0.01
+    small, factor = ("cm", 100.0) if unit == "m" and half < 1 else (unit, 1.0)
+    labels = [f"{label.partition(' [')[0]}, from the pose [{small}]" for label in ground.labels]
+    ground = Ground(ground.axes, labels, length / factor)
+    for (pose, name, color), sizes, angle in ellipses:
+        x, y = ground.flat(pose).tolist()
+        style: dict[str, Any] = {"facecolor": color, "alpha": 0.2, "label": f"95 % region, {name}"}
+        axis.add_patch(Ellipse((x, y), factor * sizes[1], factor * sizes[0], angle=angle, **style))
+    draw_layers(axis, ground, [_dot(*of) for of in shown], factor * half * np.array([[-1.0, -1.0], [1.0, 1.0]]))
+    axis.set_title(f"the pose, enlarged{'' if ellipses else ': the method states no uncertainty'}", fontsize=9)
+    axis.grid(alpha=0.25)
+    axis.legend(**BELOW)
+
+
+def _position_covariance(answer: Answer, rig_from_cam: Floats) -> Floats:
+    """Return the covariance (3, 3) of a camera's position in the world, square meters.
+
+    A small motion of the rig in its own frame, rotation w and translation t, moves a camera at c by t + w x c.
+    """
+    assert answer.result.world_from_rig is not None
+    assert answer.result.covariance is not None
+    x, y, z = rig_from_cam[:3, 3]
+    lever = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
+    moves = answer.result.world_from_rig[:3, :3] @ np.hstack([lever, np.eye(3)])
+    return np.asarray(moves @ answer.result.covariance @ moves.T)
+
+
+def _draw_table(axis: "Axes", answers: Sequence[Answer]) -> None:
+    """Write the numbers of the answers, one column each; numbers that differ are bold."""
+    columns, texts = ([0.74, 1.0] if len(answers) > 1 else [1.0]), [answer.texts for answer in answers]
+    rows = {"": list(NAMES)} if len(answers) > 1 else {}
+    labels = dict.fromkeys(label for each in texts for label in each)
+    rows |= {label: [each.get(label, "–") for each in texts] for label in labels}
+    axis.set_axis_off()
+    step = min(0.072, 1.0 / len(rows))
+    for line, (label, values) in enumerate(rows.items()):
+        style: dict[str, Any] = {"fontsize": 8, "va": "top", "transform": axis.transAxes}
+        axis.text(0.0, 1.0 - line * step, label, color="0.25", **style)
+        weight = "bold" if len(set(values)) > 1 else "normal"
+        for x, value in zip(columns, values, strict=True):
+            axis.text(x, 1.0 - line * step, value, ha="right", weight=weight, **style)

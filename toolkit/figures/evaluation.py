@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -16,10 +16,9 @@ from toolkit.results.metrics import (
     WRONG,
     Threshold,
     is_below,
-    parse_threshold,
     small_unit,
     threshold_name,
-    unit_of,
+    threshold_text,
 )
 from toolkit.runs.pairs import LEFT_OUT
 
@@ -70,63 +69,42 @@ class Evaluation:
 def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
     """Return the figures of an evaluation by name, except figures without data."""
     figures: dict[str, Figure] = {}
-    done = evaluation.recall
+    done, errors, unit = evaluation.recall, evaluation.errors, evaluation.unit
     done = done.dropna(subset=["localized"]) if "localized" in done else done.iloc[:0]
     if len(done):
-        unit = evaluation.unit
         small, factor = small_unit(unit)
-        columns = [(f"recall@{threshold_name(t, unit)}", f"recall @ {_limit(t, unit)}", 100.0, "%")
-                   for t in evaluation.thresholds]  # fmt: skip
-        figures["recall"] = draw_matrices(
-            done, columns, "Share of queries localized within the threshold", "higher", (0, 100)
-        )
-        figures["median_errors"] = draw_matrices(
-            done,
-            [("median_rotation_deg", "median rotation error", 1.0, "°"),
-             ("median_translation_m", "median translation error", factor, small)],
-            "Median errors over all queries (∞: half of them have no pose)", "lower",
-        )  # fmt: skip
-        figures["error_curves"] = draw_error_curves(evaluation.errors, evaluation.thresholds, unit)
-        if "p_correct" in evaluation.errors and evaluation.errors["p_correct"].notna().any():
-            figures["reliability"] = draw_reliability(evaluation.errors, unit)
-        if "position_std_m" in evaluation.errors and _has_deviation(evaluation.errors).any():
-            figures["deviations"] = draw_deviations(evaluation.errors, unit)
+        names = [f"recall@{threshold_name(t, unit)}" for t in evaluation.thresholds]
+        columns = [(name, f"recall @ {threshold_text(name)}", 100.0, "%") for name in names]
+        figures["recall"] = draw_matrices(done, columns, "Share of queries localized within the threshold")
+        medians = [("median_rotation_deg", "median rotation error", 1.0, "°"),
+                   ("median_translation_m", "median translation error", factor, small)]  # fmt: skip
+        title = "Median errors over all queries (∞: half of them have no pose)"
+        figures["median_errors"] = draw_matrices(done, medians, title)
+        figures["error_curves"] = draw_error_curves(errors, evaluation.thresholds, unit)
+        if errors["p_correct"].notna().any():
+            figures["reliability"] = draw_reliability(errors, unit)
+        if _has_deviation(errors).any():
+            figures["deviations"] = draw_deviations(errors, unit)
         if evaluation.losses["missed"].sum():
             figures["losses"] = draw_losses(evaluation.losses)
     if len(evaluation.sequences):
         figures["sequence"] = draw_steps(evaluation.sequences)
-    retrieval = evaluation.retrieval
-    ks = [c for c in retrieval.columns if c.startswith("recall@")]
-    if ks:
-        evaluated = retrieval.dropna(subset=ks)
-        radius, angle = evaluated["radius_m"].iloc[0], evaluated["angle_deg"].iloc[0]
-        figures["retrieval"] = draw_matrices(
-            evaluated, [(k, f"in the first {k.removeprefix('recall@')}", 100.0, "%") for k in ks]
-            + [("in_map", "anywhere in the map", 100.0, "%")],
-            f"Share of queries with a reference within {radius:g} {evaluation.unit} and {angle:g}°", "higher", (0, 100),
-        )  # fmt: skip
+    if ks := [name for name in evaluation.retrieval if name.startswith("recall@")]:
+        done = evaluation.retrieval.dropna(subset=ks)
+        reach = f"{done['radius_m'].iloc[0]:g} {unit} and {done['angle_deg'].iloc[0]:g}°"
+        columns = [(k, f"in the first {k.removeprefix('recall@')}", 100.0, "%") for k in ks]
+        columns.append(("in_map", "anywhere in the map", 100.0, "%"))
+        figures["retrieval"] = draw_matrices(done, columns, f"Share of queries with a reference within {reach}")
     return figures
 
 
-def _limit(threshold: Threshold, unit: str) -> str:
-    return f"{threshold[0]:g}°, {threshold[1]:g} {unit}"
-
-
 @styled
-def draw_matrices(
-    table: pd.DataFrame,
-    columns: Sequence[tuple[str, str, float, str]],
-    title: str,
-    better: str,
-    limits: tuple[float, float] | None = None,
-) -> "Figure":
-    """Draw map device x query device matrices side by side.
+def draw_matrices(table: pd.DataFrame, columns: Sequence[tuple[str, str, float, str]], title: str) -> "Figure":
+    """Draw map device x query device matrices side by side: shares, blue where high, or errors, orange where high.
 
     Args:
         table: one row per pair.
-        columns: for each panel the name of a column, its title, factor and unit.
-        better: `higher` or `lower` values are good; chooses the color map.
-        limits: values after the factor at which the colors begin and end; None: 0 and the largest value.
+        columns: for each panel the name of a column, its title, factor and unit; % for shares.
     """
     figure = new_figure(3.1 * len(columns) + 0.4, 3.35)
     maps, queries = (in_order(table[c]) for c in ("map_device", "query_device"))
@@ -136,23 +114,21 @@ def draw_matrices(
         for row in table.itertuples():
             i, j = maps.index(row.map_device), queries.index(row.query_device)
             values[i, j] = factor * float(table.at[row.Index, column])
-        finite = values[np.isfinite(values)]
+        is_share, finite = unit == "%", values[np.isfinite(values)]
         # At least thrice the median: only values that stand out are dark.
-        largest = max(float(finite.max()), 3 * float(np.median(finite)), 1e-9) if len(finite) else 1.0
-        low, high = limits or (0.0, largest)
-        shade = (np.clip(values, low, high) - low) / (high - low)
-        axis.imshow(shade, cmap="Blues" if better == "higher" else "Oranges", vmin=-0.08, vmax=1.25)
+        high = max(float(finite.max()), 3 * float(np.median(finite)), 1e-9) if len(finite) else 1.0
+        shade = np.clip(values, 0, 100) / 100 if is_share else np.clip(values, 0, high) / high
+        axis.imshow(shade, cmap="Blues" if is_share else "Oranges", vmin=-0.08, vmax=1.25)
         for (i, j), value in np.ndenumerate(values):
-            text = percent(value / 100) if unit == "%" else number(value)
+            text = percent(value / 100) if is_share else number(value)
             axis.text(j, i, text, ha="center", va="center", fontsize=12,
                       color="white" if shade[i, j] > 0.6 else "black")  # fmt: skip
-        axis.set_xticks(range(len(queries)), queries)
-        axis.set_yticks(range(len(maps)), maps)
+        for side, devices in ((axis.xaxis, queries), (axis.yaxis, maps)):
+            side.set_ticks(range(len(devices)), devices)
+            side.set_ticks(np.arange(len(devices) - 1) + 0.5, minor=True)
         axis.set_xlabel("query")
         axis.set_title(f"{name} [{unit}]", fontsize=10)
         axis.tick_params(which="both", length=0)
-        axis.set_xticks(np.arange(len(queries) - 1) + 0.5, minor=True)
-        axis.set_yticks(np.arange(len(maps) - 1) + 0.5, minor=True)
         axis.grid(which="minor", color="white", lw=2)
         axis.spines[:].set_visible(False)
     axes[0].set_ylabel("map")
@@ -212,21 +188,18 @@ def draw_reliability(errors: pd.DataFrame, unit: str = "m") -> "Figure":
     axis.plot([0, 100], [0, 100], color="0.6", lw=1, ls=":", label="as stated")
     for k in np.unique(bin_of):
         in_bin = bin_of == k
-        count, share = int(in_bin.sum()), float(right[in_bin].mean())
+        count, share, x = int(in_bin.sum()), float(right[in_bin].mean()), 100 * stated[in_bin].mean()
         low, high = wilson_interval(share, count)
-        x = 100 * stated[in_bin].mean()
-        axis.errorbar(
-            x, 100 * share, [[100 * max(share - low, 0)], [100 * max(high - share, 0)]], fmt="o", color=SKY, capsize=3
-        )
-        offset, side = ((-6, -10), "right") if x > 90 else ((6, -10), "left")
-        axis.annotate(
-            str(count), (x, 100 * share), offset, textcoords="offset points", ha=side, fontsize=8, color="0.3"
-        )
+        reach = [[100 * max(share - low, 0)], [100 * max(high - share, 0)]]
+        axis.errorbar(x, 100 * share, reach, fmt="o", color=SKY, capsize=3)
+        place: dict[str, Any] = {"xytext": (-6, -10), "ha": "right"} if x > 90 else {"xytext": (6, -10), "ha": "left"}
+        axis.annotate(str(count), (x, 100 * share), textcoords="offset points", fontsize=8, color="0.3", **place)
     axis.set(xlim=(-3, 103), ylim=(-3, 103))
     axis.set(xlabel="stated probability of being right [%]", ylabel="poses that are right [%]")
     axis.legend(frameon=False, fontsize=8, loc="upper left")
     axis.grid(alpha=0.25)
-    figure.suptitle(f"Stated and actual probability of being right (right: {_limit(WRONG, unit)})")
+    right_is = threshold_text(threshold_name(WRONG, unit))
+    figure.suptitle(f"Stated and actual probability of being right (right: {right_is})")
     return figure
 
 
@@ -294,7 +267,7 @@ def draw_losses(losses: pd.DataFrame) -> "Figure":
         for y, value in enumerate(left):
             axis.text(value + 0.012 * widest, y, f"{value:.0f}", va="center", fontsize=8, color="0.3")
         axis.set(xlim=(0, widest), xlabel="queries [%]")
-        axis.set_title(f"missed @ {_limit(parse_threshold(threshold), unit_of(threshold))}", fontsize=10)
+        axis.set_title(f"missed @ {threshold_text(threshold)}", fontsize=10)
         axis.grid(axis="x", alpha=0.25)
     axes[0].set_yticks(range(len(pairs)), [f"{q} in {m} map" for m, q in pairs])
     axes[0].invert_yaxis()

@@ -86,16 +86,14 @@ def list_poses(path: str | Path) -> pd.DataFrame:
 @styled
 def draw_samples(capture: Capture, count: int = 4) -> "Figure":
     """Draw `count` images of each session, evenly spread over the recording; return the figure."""
-    names = [session.id for session in _usable(capture) if len(session)]
-    if not names:
+    sessions = [session for session in _usable(capture) if len(session)]
+    if not sessions:
         return _empty("no session with images can be used")
-    figure = new_figure(2.4 * count, 1.9 * len(names))
-    axes = figure.subplots(len(names), count, squeeze=False)
-    for line, name in zip(axes, names, strict=True):
-        session = capture[name]
+    figure = new_figure(2.4 * count, 1.9 * len(sessions))
+    for line, session in zip(figure.subplots(len(sessions), count, squeeze=False), sessions, strict=True):
         for axis, row in zip(line, np.linspace(0, len(session) - 1, count).round().astype(int), strict=True):
             draw_image(axis, session.image_path(row), 2.4)
-        line[0].set_ylabel(name)
+        line[0].set_ylabel(session.id)
     return figure
 
 
@@ -108,16 +106,16 @@ def draw_top_view(capture: Capture, up: ArrayLike | None = None, unit: str | Non
         up: up direction (3,); None: estimated from the cameras.
         unit: unit of the poses, None if unknown; `auto`: that of the capture.
     """
-    unit = capture.unit if unit == "auto" else unit
-    poses = {session.id: of_session for session in _usable(capture) if len(of_session := _poses(session))}
-    if not poses:
-        return _empty("no session with poses can be used")
-    everything = np.concatenate(list(poses.values()))
     layers = []
-    for name, of_session in poses.items():
-        style = {"s": 14} if capture[name].split == "map" else {"s": 36, "marker": "x"}
-        layers.append(Layer(of_session, name, color_of(capture[name].device), alpha=0.8, **style))
-    figure, _, panels = draw_places(Ground.below(everything, up, (unit, 1.0)), layers, everything)
+    for session in _usable(capture):
+        style = {"s": 14} if session.split == "map" else {"s": 36, "marker": "x"}
+        if len(poses := _poses(session)):
+            layers.append(Layer(poses, session.id, color_of(session.device), alpha=0.8, **style))
+    if not layers:
+        return _empty("no session with poses can be used")
+    everything = np.concatenate([layer.at for layer in layers])
+    ground = Ground.below(everything, up, (capture.unit if unit == "auto" else unit, 1.0))
+    figure, _, panels = draw_places(ground, layers, everything)
     shared_legend(figure, [axis for axis, _, _ in panels], ncols=6, frameon=False, fontsize=8)
     figure.suptitle("Cameras from above: maps (dots), queries where their pose is known (crosses)")
     return figure
@@ -137,14 +135,14 @@ def draw_similarity(embeddings: str | Path, limit: int = 300) -> "Figure":
 
     first = next(iter(embedding_folders(embeddings).values()))
     sessions = [folder.name for folder in sorted(first.iterdir()) if folder.is_dir()]
-    query = next((name for name in sessions if name.endswith("_query")), next(iter(sessions)))
-    maps = [name for name in sessions if name.endswith("_map")] or list(sessions)
-    device = query.rpartition("_")[0]
-    map_ = next((name for name in maps if name.rpartition("_")[0] != device), maps[0])
-    figure = new_figure(8, 4.5)
-    plot = figure.subplots()
+    query = next((name for name in sessions if name.endswith("_query")), sessions[0])
+    maps = [name for name in sessions if name.endswith("_map")] or sessions
+    of_others = (name for name in maps if name.rpartition("_")[0] != query.rpartition("_")[0])
+    map_ = next(of_others, maps[0])
     rows, columns = (_descriptors(Path(embeddings), session, limit) for session in (query, map_))
     products = [row @ column.T for row, column in zip(rows, columns, strict=True)]
+    figure = new_figure(8, 4.5)
+    plot = figure.subplots()
     values = products[0] if len(products) == 1 else fuse(products)
     image = plot.imshow(values, aspect="auto", interpolation="nearest", cmap="viridis")
     plot.set(xlabel=f"images of {map_}", ylabel=f"images of {query}")
@@ -193,8 +191,7 @@ def _draw_rows(
         return _empty(f"no queries of {query_device}")
     width = 1 + references * max(len(row) for row in rows)
     figure = new_figure(2.2 * width, 1.9 * len(rows))
-    axes = figure.subplots(len(rows), width, squeeze=False)
-    for line, row in zip(axes, rows, strict=True):
+    for line, row in zip(figure.subplots(len(rows), width, squeeze=False), rows, strict=True):
         for axis in line[1:]:
             axis.set_axis_off()  # a query may have fewer references
         shown = [(line[0], row[0], f"query {query_device}")]
@@ -215,12 +212,10 @@ def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
     Args:
         paths: poses of each pair, `<scene>_map_<M>_query_<Q>.txt` or `.csv`.
     """
-    pairs = [PairResults.open(path) for path in paths]
-    tables = {results.devices: results.table for results in pairs}
+    tables = {results.devices: results.table for results in map(PairResults.open, paths)}
     figure = new_figure(8, 0.35 * len(tables) + 1.2)
     plot = figure.subplots()
-    colors = {"ok": GREEN, "low_confidence": ORANGE, "failed": VERMILLION}
-    for status, color in colors.items():
+    for status, color in {"ok": GREEN, "low_confidence": ORANGE, "failed": VERMILLION}.items():
         rows = [table[statuses(table["status"]) == status] for table in tables.values()]
         inliers = np.concatenate([row["num_inliers"].fillna(0).to_numpy(float) for row in rows])
         heights = np.repeat(np.arange(len(rows)), [len(row) for row in rows])

@@ -1,11 +1,13 @@
-"""Inspect one query of a finished run: the stored results of the localize stage in words, numbers and pictures.
+"""Inspect one query of a finished run: the stored results of the localize stage in words, numbers and figures.
 
 Nothing here localizes, except `Inspection.again`.
 """
 
+import difflib
 import json
+import os
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -16,16 +18,16 @@ import numpy as np
 import pandas as pd
 
 from toolkit.capture import Capture
-from toolkit.errors import OF_THE_DATA, ArtifactError
-from toolkit.figures.answers import Answer
-from toolkit.figures.choice import find_query, shown_name
-from toolkit.figures.inspection_view import draw_answers
+from toolkit.errors import OF_THE_DATA, ArtifactError, ToolkitError
+from toolkit.figures.answers import Answer, draw_answers
+from toolkit.figures.query_images import shown_name
 from toolkit.figures.style import shown
 from toolkit.files import SceneFiles, image_name, pair_devices, read_references, require_current
 from toolkit.manifest import LocalizeSettings, nearest
 from toolkit.pose.result import QueryResult
-from toolkit.results.images import LocalizedPair
+from toolkit.results.localized import LocalizedPair
 from toolkit.results.metrics import worst_first
+from toolkit.runs.kernel import TEXT_BARS
 from toolkit.scene.map import WITHOUT_FEATURES, Map
 from toolkit.scene.opening import RETRIEVAL, SESSIONS_ROOT, how_localized
 from toolkit.scene.stored import StoredQueries
@@ -120,17 +122,16 @@ class InspectedPair:
         Raises:
             ArtifactError: the pair does not exist, or its files are missing or torn.
         """
-        pairs = sorted(Path(poses_dir).glob("*_map_*_query_*.h5"))
-        names = [pair_devices(path.stem) for path in pairs]
-        if (map_device, query_device) not in names:
-            known = [f"{query} in {map_}" for map_, query in names]
+        pairs = {pair_devices(path.stem): path for path in sorted(Path(poses_dir).glob("*_map_*_query_*.h5"))}
+        if (map_device, query_device) not in pairs:
+            known = [f"{query} in {map_}" for map_, query in pairs]
             raise ArtifactError(
                 f"{poses_dir}: no correspondences of queries of {query_device!r} in the map of {map_device!r}, "
                 f"`<pair>.h5`. {nearest(f'{query_device} in {map_device}', known)} Localize first: "
                 "python -m toolkit run MANIFEST."
             )
-        self.map_device, self.query_device = map_device, query_device
-        self._h5 = pairs[names.index((map_device, query_device))]
+        self.map_device, self.label = map_device, f"{query_device} in the map of {map_device}"
+        self._h5 = pairs[map_device, query_device]
         files = SceneFiles(self._h5.parents[2], self._h5.parents[1].name)
         self._features_dir, self._map_dir = Path(features_dir or files.features), Path(map_dir or files.maps)
         self.settings, paths, _ = how_localized(self._h5)
@@ -143,10 +144,6 @@ class InspectedPair:
     def __len__(self) -> int:
         return len(self.names)
 
-    @property
-    def label(self) -> str:
-        return f"{self.query_device} in the map of {self.map_device}"
-
     def look(self, query: int | str = 0) -> Inspection:
         """Return a query with the stored results of the localize stage.
 
@@ -157,7 +154,7 @@ class InspectedPair:
             ArtifactError: no query matches, or several do (the nearest is named), or its stored results are damaged.
         """
         if query == WORST and len(self):
-            query = int(worst_first(self.localized.table)[0])
+            query = int(worst_first(self.localized.localizations.errors)[0])
         names = self.localized.query_session.image_names
         images = {names[row]: number for number, rows in enumerate(self.localized.rows) for row in rows}
         number = find_query(query, images, len(self))
@@ -202,8 +199,7 @@ class InspectedPair:
         best: dict[str, tuple[int, float]] = {}
         for key in zip(images["timestamp"].tolist(), images["sensor_id"].astype(str).tolist(), strict=True):
             for rank, hit in enumerate(self._topk.get(key, []), start=1):
-                name = image_name(hit["path"])
-                ranked = rank, float(hit.get("score", np.nan))
+                name, ranked = image_name(hit["path"]), (rank, float(hit.get("score", np.nan)))
                 best[name] = min(best.get(name, ranked), ranked, key=lambda one: (one[0], -one[1]))
         return dict(sorted(best.items(), key=lambda item: item[1][0]))
 
@@ -232,7 +228,7 @@ class WorstQueries:
                 with suppress(*OF_THE_DATA):  # an unfinished pair has no table, or a session broke after a good run
                     pairs.append(InspectedPair(mapped, queried, poses_dir, None, map_dir, sessions_root))
         queries = [(pair, number) for pair in pairs for number in range(len(pair))]
-        tables = [pair.localized.table for pair in pairs]
+        tables = [pair.localized.localizations.errors for pair in pairs]
         order = worst_first(pd.concat(tables, ignore_index=True)).tolist() if queries else []
         self._queries = [queries[k] for k in order]
         self.names = [f"{pair.label}: {shown_name(pair.names[number])}" for pair, number in self._queries]
@@ -249,13 +245,7 @@ class WorstQueries:
         return pair.look(number)
 
 
-def inspect_query(
-    run: str | Path,
-    scene: str,
-    map: str,  # noqa: A002
-    query: str,
-    n: int | str = 0,
-) -> Inspection:
+def inspect_query(run: str | Path, scene: str, map: str, query: str, n: int | str = 0) -> Inspection:  # noqa: A002
     """Return one query of a finished run with the stored results of the localize stage.
 
     Args:
@@ -275,3 +265,93 @@ def inspect_query(
             "Localize first: python -m toolkit run MANIFEST."
         )
     return InspectedPair(map, query, files.poses_dir, files.features, files.maps).look(n)
+
+
+# One of many queries in a notebook
+
+
+def find_query(query: object, images: Mapping[str, int], count: int) -> int:
+    """Return the number of a query.
+
+    Args:
+        query: its number, the name of one of its images, or a unique end of the name.
+        images: number of the query by the name of each image.
+        count: number of queries.
+
+    Raises:
+        ArtifactError: no query matches, or several do; names the nearest.
+    """
+    if isinstance(query, int | np.integer) and not isinstance(query, bool):
+        if 0 <= query < count:
+            return int(query)
+        raise ArtifactError(f"query: found {query}, expected a number from 0 to {count - 1}, or the name of an image.")
+    if not isinstance(query, str | Path):
+        raise ArtifactError(f"query: found {query!r}, expected a number or the name of an image.")
+    name = image_name(str(query))
+    numbers = {images[name]} if name in images else {images[image] for image in images if image.endswith(f"/{name}")}
+    if len(numbers) == 1:
+        return numbers.pop()
+    if numbers:
+        raise ArtifactError(f"query: {len(numbers)} queries have an image name that ends in {name!r}; give more of it.")
+    close = difflib.get_close_matches(name, images, n=1, cutoff=0.0)
+    hint = f"The nearest of its {len(images)} images is {close[0]!r}." if close else "The pair has no queries."
+    raise ArtifactError(f"query: no query of the pair has an image {str(query)!r}. {hint}")
+
+
+@dataclass
+class Choice:
+    """The query that `choose` shows now; None without queries."""
+
+    shown: Any
+
+    def attempt(self, ask: Callable[[Any], Any]) -> None:
+        """Display `ask` of the shown query, or print its error, so that a notebook does not fail."""
+        from IPython.display import display
+
+        if self.shown is not None:
+            try:
+                display(ask(self.shown))
+            except ToolkitError as error:
+                print(error)
+
+
+def choose(queries: Any, chosen: int | str = 0) -> Choice:
+    """Show a query, and a list to choose another in its place; return the choice.
+
+    The figure is ordinary output, which a saved notebook keeps. There is no list when the pipeline runs the notebook.
+
+    Args:
+        queries: `RetrievedPair`, `InspectedPair` or `WorstQueries`: has `names`, and `look`, which takes a number.
+        chosen: number or name of the first query; ignored if it is a number and there are no queries.
+
+    Raises:
+        ArtifactError: the query does not exist.
+    """
+    from IPython.display import display
+
+    if not len(queries.names) and isinstance(chosen, int):
+        print("There are no queries to show.")
+        return Choice(None)
+    choice = Choice(queries.look(chosen))
+    if TEXT_BARS in os.environ:
+        display(choice.shown)
+        return choice
+    import ipywidgets
+
+    at = chosen if isinstance(chosen, int) else choice.shown.number
+    options = [(f"{k}: {shown_name(name)}", k) for k, name in enumerate(queries.names)]
+    layout = ipywidgets.Layout(width="95%")
+    dropdown = ipywidgets.Dropdown(options=options, value=at, description="query", layout=layout)
+    display(dropdown)
+    handle = display(choice.shown, display_id=True)
+
+    def show(change: dict[str, Any]) -> None:
+        try:
+            choice.shown = queries.look(change["new"])
+        except ToolkitError as error:
+            handle.update({"text/plain": str(error)}, raw=True)
+        else:
+            handle.update(choice.shown)
+
+    dropdown.observe(show, "value")
+    return choice

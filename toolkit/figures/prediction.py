@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from toolkit.figures.query_images import draw_image
 from toolkit.figures.style import BLUE, GRAY, GREEN, VERMILLION, new_figure, styled
 from toolkit.figures.top_view import Ground, Layer, draw_layers, window_of
-from toolkit.pose.base import Query, View
+from toolkit.pose.base import Query
 from toolkit.prediction.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer
 
 if TYPE_CHECKING:
@@ -46,46 +46,39 @@ def draw_prediction(
     panels = right.subplots(2 * rows, columns, squeeze=False)
     for axis in panels.flat:
         axis.set_axis_off()
-    for number, view in enumerate(views):
+    labels = ["query", *(f"reference {k}: {'consistent' if good else 'left out'}" for k, good in enumerate(kept, 1))]
+    colors = ["black", *(GREEN if good else VERMILLION for good in kept)]
+    for number, (view, label, color) in enumerate(zip(views, labels, colors, strict=True)):
         row, column = 2 * (number // columns), number % columns
-        label, color = "query", "black"
-        if number:
-            label = f"reference {number}: {'consistent' if kept[number - 1] else 'left out'}"
-            color = GREEN if kept[number - 1] else VERMILLION
-        _draw_view(panels[row, column], panels[row + 1, column], view, number, result, label, color)
-    simulated = localizer.predictor.simulated
+        panels[row, column].set_axis_on()
+        draw_image(panels[row, column], view.image, 3, label, color, frame=color)
+        _draw_depth(panels[row + 1, column], number, result)
+    simulated, estimate = localizer.predictor.simulated, answer.estimate
     title = f"{'SIMULATED, no result: ' if simulated else ''}{localizer.predictor.name} on {views[0].name}"
-    estimate = answer.estimate
     scale = f"scale known to {estimate.scale_std:.1%}" if np.isfinite(estimate.scale_std) else "scale unknown"
-    status = f"{estimate.status}; {scale}" if estimate.world_from_rig is not None else estimate.status
+    status = estimate.status_text + (f"; {scale}" if estimate.world_from_rig is not None else "")
     reason = "" if result.reason in status else f"; {result.reason}"  # the status of a failed query contains it
     text = textwrap.fill(status + reason, 150)
     figure.suptitle(f"{title}\n{text}", fontsize=10, fontweight="bold" if simulated else None)
     return figure
 
 
-def _draw_view(
-    photograph: "Axes", depth: "Axes", view: View, number: int, result: CameraAnswer, label: str, color: str
-) -> None:
-    photograph.set_axis_on()
-    draw_image(photograph, view.image, 3, label, color, frame=color)
-    prediction = result.prediction
-    if prediction is None or prediction.depth is None:
+def _draw_depth(axis: "Axes", number: int, result: CameraAnswer) -> None:
+    """Draw the depth predicted of an image, in meters if the scale is known."""
+    prediction, alignment = result.prediction, result.alignment
+    if prediction is None or prediction.depth is None or not np.isfinite(prediction.depth[number]).any():
         return
-    scale = np.nan if result.alignment is None else result.alignment.world_from_model.scale
-    metric = result.alignment is not None and result.alignment.scale_known
-    values = prediction.depth[number] * (scale if metric else 1.0)
-    if not np.isfinite(values).any():
-        return
+    metric = alignment is not None and alignment.scale_known
+    values = prediction.depth[number] * (alignment.world_from_model.scale if alignment is not None and metric else 1.0)
     low, high = np.nanpercentile(values, (5, 95))
     extent = None
-    if prediction.map_from_image is not None:  # draw in pixels of the photograph
+    if prediction.map_from_image is not None:  # draw in pixels of the image
         scale_x, scale_y, offset_x, offset_y = prediction.map_from_image[number]
         height, width = values.shape
         left, right = -offset_x / scale_x, (width - offset_x) / scale_x
         extent = (left, right, (height - offset_y) / scale_y, -offset_y / scale_y)
-    depth.imshow(values, cmap="viridis", vmin=low, vmax=high, extent=extent)
-    depth.set_title(f"depth {low:.1f} to {high:.1f} {'m' if metric else '(no unit)'}", fontsize=7)
+    axis.imshow(values, cmap="viridis", vmin=low, vmax=high, extent=extent)
+    axis.set_title(f"depth {low:.1f} to {high:.1f} {'m' if metric else '(no unit)'}", fontsize=7)
 
 
 def _draw_from_above(

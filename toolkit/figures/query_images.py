@@ -1,31 +1,44 @@
-"""Draw images of a query and of its references, with the matches between them."""
+"""Draw queries beside their references, with the matches between them."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
 
 from toolkit.capture.images import read_for_display
-from toolkit.figures.style import ESTIMATED, GREEN, SKY, inches_to_pixels
-from toolkit.geometry import Floats
-from toolkit.results.images import QueryDetails, ShownImage
+from toolkit.figures.style import ESTIMATED, GREEN, SKY, inches_to_pixels, new_figure, styled
+from toolkit.files import own_name
+from toolkit.geometry import Floats, pose_error, project
+from toolkit.results.localized import QueryDetails, ShownImage
+from toolkit.results.metrics import is_posed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
 
 PURPLE = "#CC79A7"
 WAYS = {"": GREEN, "guided": GREEN, "descriptors": SKY, "lifted": PURPLE}
 """Colors of correspondences that agree with the pose, by how they were found."""
 MARKERS = {"": "o", "sift": "o", "aliked": "^", "superpoint": "s"}
 """Markers, by kind of features."""
-LINES = 60
-"""Lines drawn at most for correspondences that agree, and for rejected ones: more would hide the images."""
+MAX_LINES = 60
+"""Lines drawn for correspondences that agree, and for rejected ones: more would hide the images."""
+MAX_LETTERS = 60
+"""Letters of an image name on the sheet of the worst queries: more would run into the next image."""
+
+
+def shown_name(name: str, most: int = 1000) -> str:
+    """Return an image's name as the user knows it: without its session, and at most its last `most` letters."""
+    name = own_name(name.rpartition("/raw_data/")[2])
+    return name if len(name) <= most else f"…{name[1 - most :]}"
 
 
 def query_and_references(
-    figure: "Figure", count: int, rows: int, query_ratio: float, widest: float
+    figure: "Figure | SubFigure", count: int, rows: int, query_ratio: float, widest: float
 ) -> tuple["Axes", list["Axes"]]:
     """Return axes of a query, and of its references in some rows to the right, which are as high together.
 
@@ -51,15 +64,15 @@ def draw_image(
     """Draw an image and return its right edge; a `ShownImage` is drawn in its own pixels.
 
     Args:
-        inches: its longer side in the figure.
+        inches: its longer side in the figure; of a `ShownImage` its height, if it is wider than high.
         color: color of the title.
         frame: color of the frame; None: no frame.
         left, height: where a `ShownImage` begins, and its height, in pixels of another image; None: its own.
     """
     extent = None
     if isinstance(image, ShownImage):
-        height = image.camera.height if height is None else height
-        extent = (left, left + height * image.camera.width / image.camera.height, height, 0)
+        height, ratio = image.camera.height if height is None else height, image.ratio
+        extent, inches = (left, left + height * ratio, height, 0), inches * max(1.0, ratio)
         image = image.path
     pixels = read_for_display(image, inches_to_pixels(inches)) if isinstance(image, Path) else image
     axis.imshow(pixels, cmap="gray", extent=extent, interpolation="antialiased")
@@ -80,20 +93,20 @@ def draw_matches(
     image: ShownImage,
     size: float,
     by_kind: bool = False,
-    only: NDArray[np.bool_] | None = None,
+    only: NDArray[np.bool_] | bool = True,
     at: Floats | None = None,
 ) -> None:
     """Draw the keypoints of an image: those that agree with the pose, and those of rejected matches.
 
     Args:
         by_kind: whether colors and markers tell how matches were found; else those that agree are green.
-        only: (n,) the keypoints to draw; None: all.
+        only: (n,) the keypoints to draw; True: all.
         at: (n, 2) where they are drawn; None: at their pixels.
     """
     kinds = image.found_by if by_kind else np.full(len(image.pixels), "")
     for agrees in (False, True):
         for kind in sorted(set(kinds.tolist())):
-            chosen = (kinds == kind) & (image.inlier == agrees) & (True if only is None else only)
+            chosen = (kinds == kind) & (image.inlier == agrees) & only
             if chosen.any():
                 x, y = (image.pixels if at is None else at)[chosen].T
                 axis.scatter(x, y, s=size, lw=0, alpha=0.9 if agrees else 0.6, **style_of(kind, agrees))
@@ -106,26 +119,118 @@ def draw_joined(axis: "Axes", query: QueryDetails, inches: float, by_kind: bool 
         inches: height in the figure.
         by_kind: see `draw_matches`; the query then also has the keypoints that the reference does not see.
     """
-    from matplotlib.collections import LineCollection
-
     image, height = query.cameras[0], query.cameras[0].camera.height
-    end = draw_image(axis, image, inches * max(1.0, image.camera.width / height))
+    end = draw_image(axis, image, inches)
     if by_kind:
         draw_matches(axis, image, 9, by_kind)
     for reference, _, _ in query.captioned_references()[:1]:
         left = 1.02 * end
-        camera = reference.camera
-        end = draw_image(axis, reference, inches * max(1.0, camera.width / camera.height), left=left, height=height)
+        end = draw_image(axis, reference, inches, left=left, height=height)
         _, i, j = np.intersect1d(image.matches, reference.matches, return_indices=True)
-        seen = reference.pixels * (height / camera.height) + [left, 0.0]
+        seen = reference.pixels * (height / reference.camera.height) + [left, 0.0]
         draw_matches(axis, reference, 5, by_kind, np.isin(reference.matches, image.matches), seen)
         if not by_kind:
             draw_matches(axis, image, 5, only=np.isin(image.matches, reference.matches))
         lines = np.stack([image.pixels[i], seen[j]], axis=1)
         for agrees in (False, True):
             chosen = np.flatnonzero(image.inlier[i] == agrees)
-            chosen = chosen[:: len(chosen) // LINES + 1]
+            chosen = chosen[:: len(chosen) // MAX_LINES + 1]
             kinds = image.found_by[i[chosen]].tolist() if by_kind else [""] * len(chosen)
             colors = [style_of(kind, agrees)["color"] for kind in kinds]
             axis.add_collection(LineCollection(list(lines[chosen]), colors=colors, linewidths=0.6, alpha=0.7))
     axis.set(xlim=(0, end), ylim=(height, 0), aspect="equal")
+
+
+@styled
+def draw_localization(query: QueryDetails, title: str = "", unit: tuple[str, float] = ("m", 1.0)) -> "Figure":
+    """Draw the first image of a query beside its references, with their correspondences; return the figure.
+
+    Green dots are the projections of map points that agree with the pose; a white line joins each to its measured
+    keypoint. Orange dots are keypoints of rejected matches. The references have the same colors. A pose without matches
+    is shown with the references that it was computed from, and those that were rejected.
+
+    Args:
+        query: the query; its first image is drawn.
+        title: title of the figure; if the true pose is known, the errors are appended.
+        unit: unit that lengths are shown in, see `metrics.length_unit`.
+    """
+    query = query.of_first_camera()
+    shown, references = query.cameras[0], query.captioned_references()
+    # The query is as high as two rows of references, to keep its points visible.
+    rows = 2 if len(references) > 1 else 1
+    size = shown.camera.width, shown.camera.height
+    widest = max((image.ratio for image, _, _ in references), default=1.0)
+    figure = new_figure(4.4 * (shown.ratio + widest * -(-len(references) // rows) / rows) + 0.6, 5.3)
+    axis, panels = query_and_references(figure, len(references), rows, shown.ratio, widest)
+    located, good = bool(is_posed(shown.world_from_cam)), shown.inlier
+    if not located:
+        caption = "query: not localized" + (f", {len(good)} matches" if len(good) else "")
+    elif query.has_matches:
+        caption = f"query: {shown.num_inliers} of {len(good)} map points agree"
+    else:
+        caption = "query: no matches, the pose comes from the references"
+    draw_image(axis, shown, 4.4, caption, frame=GREEN if located else ESTIMATED)
+    draw_matches(axis, shown, 7, only=~good)
+    if located and good.any():
+        projected, visible = project(shown.points, shown.camera, shown.world_from_cam)
+        inside = good & visible & (projected >= 0).all(1) & (projected < size).all(1)
+        lines = np.stack([shown.pixels[inside], projected[inside]], axis=1)
+        axis.add_collection(LineCollection(list(lines), colors="white", linewidths=0.8))
+        x, y = projected[inside].T
+        axis.scatter(x, y, s=11, c=GREEN, edgecolors="white", lw=0.35)
+    axis.set(xlim=(0, size[0]), ylim=(size[1], 0))
+    for panel, (image, text, agrees) in zip(panels, references, strict=True):
+        draw_image(panel, image, 4.4 / rows, text, frame="0.6" if agrees else ESTIMATED)
+        draw_matches(panel, image, 4)
+    if located and is_posed(shown.world_from_cam_true):
+        rotation_deg, distance = map(float, pose_error(shown.world_from_cam, shown.world_from_cam_true))
+        title = f"{title}{' · ' if title else ''}{_off_by(rotation_deg, distance / unit[1], unit[0])}"
+    figure.suptitle(title)
+    return figure
+
+
+@dataclass(frozen=True)
+class WorstQuery:
+    """A query on the sheet of the worst queries."""
+
+    pair: str
+    reason: str
+    """Status and counts of matches."""
+    details: QueryDetails
+    rotation_deg: float = np.nan
+    translation_m: float = np.nan
+    """Its errors; NaN without a pose or ground truth."""
+    unit: str = "m"
+    """Unit of lengths."""
+
+
+@styled
+def draw_worst(queries: Sequence[WorstQuery], title: str = "The worst queries") -> "Figure":
+    """Draw queries, the worst first, each beside its best reference with lines between common points."""
+    columns = 2 if len(queries) > 1 else 1
+    rows = max(1, -(-len(queries) // columns))
+    figure = new_figure(6.0 * columns, 2.75 * rows + 0.8)
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axis in panels:
+        axis.set_axis_off()
+    if not len(queries):
+        panels[0].text(0.5, 0.5, "no queries", ha="center")
+    for rank, (axis, query) in enumerate(zip(panels, queries, strict=False), start=1):
+        draw_joined(axis, query.details, 2.2)
+        image, references = query.details.cameras[0], query.details.captioned_references()
+        if references and not image.inlier[np.isin(image.matches, references[0][0].matches)].any():
+            text = "no common points" if query.details.has_matches else f"no matches; {references[0][1]}"
+            box = {"facecolor": "black", "alpha": 0.6, "lw": 0, "pad": 2}
+            axis.text(0.5, 0.04, text, ha="center", color="white", fontsize=8, bbox=box, transform=axis.transAxes)
+        has_error = np.isfinite(query.translation_m)
+        off = f"{_off_by(query.rotation_deg, query.translation_m, query.unit)}; " if has_error else ""
+        text = f"{rank}. {query.pair}: {off}{query.reason}\n{shown_name(image.name, MAX_LETTERS)}"
+        axis.set_title(text, fontsize=8, loc="left", wrap=True)
+    legend = "left: query, right: its best reference; lines: agreeing (green) and rejected matches (orange) of both"
+    figure.suptitle(f"{title}\n({legend})")
+    return figure
+
+
+def _off_by(rotation_deg: float, length: float, unit: str) -> str:
+    small = f"{100 * length:.2g} cm" if unit == "m" and length < 0.995 else f"{length:.3g} {unit}"
+    return f"off by {rotation_deg:.2g}°, {small}"

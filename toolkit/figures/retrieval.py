@@ -13,24 +13,23 @@ from numpy.typing import NDArray
 from toolkit.capture import Capture, Session
 from toolkit.embedders import open_descriptors
 from toolkit.errors import ArtifactError
-from toolkit.figures.choice import find_query, shown_name
-from toolkit.figures.query_images import draw_image, query_and_references
+from toolkit.figures.inspection import find_query
+from toolkit.figures.query_images import draw_image, query_and_references, shown_name
 from toolkit.figures.style import BLUE, GRAY, GREEN, MAP, ORANGE, TRUE, new_figure, shared_legend, shown, styled
 from toolkit.figures.top_view import Ground, Layer, draw_layers, window_of
 from toolkit.files import image_name, pair_devices, read_references, require_current
 from toolkit.geometry import Floats, Ints
-from toolkit.results.metrics import is_posed
-from toolkit.results.overlap import LEAST_OVERLAP, overlap_in_view, seen_by
+from toolkit.results.metrics import MIN_OVERLAP, is_posed, overlap_of
 from toolkit.results.pair import load_maps, map_files
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MOST = 2000
-"""Map images that a query is compared with besides its references, at most: a regular sample."""
-IN_ROW = 5
-"""References per row, at most."""
+MAX_COMPARED = 2000
+"""Map images that a query is compared with besides its references: a regular sample."""
+MAX_IN_ROW = 5
+"""References per row."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ class RetrievedQuery:
         return draw_retrieved(self)
 
     def __repr__(self) -> str:
-        good = f", {int((self.references['overlap'] >= LEAST_OVERLAP).sum())} overlap" if self.is_known else ""
+        good = f", {int((self.references['overlap'] >= MIN_OVERLAP).sum())} overlap" if self.is_known else ""
         return f"query image {self.number}: {self.name}\n{len(self.references)} references{good}"
 
     def _repr_mimebundle_(self, **_: Any) -> dict[str, bytes]:
@@ -111,8 +110,8 @@ class RetrievedPair:
     def look(self, query: int | str = 0) -> RetrievedQuery:
         """Return the retrieval of a query image.
 
-        A map image overlaps with the query if at least `LEAST_OVERLAP` of the map points that it observes lie in the
-        query's view at the true pose (`overlap.overlap_in_view`). Without a triangulated map, points at 2, 4, 8 and
+        A map image overlaps with the query if at least `MIN_OVERLAP` of the map points that it observes lie in the
+        query's view at the true pose (`metrics.overlap_in_view`). Without a triangulated map, points at 2, 4, 8 and
         16 m in the map image's view replace the map points; these ignore walls. Without a true pose, overlap is NaN.
         Similarities are computed from the stored descriptors.
 
@@ -129,12 +128,15 @@ class RetrievedPair:
         row = self.session.row_of_name[self.names[number]]
         names = [image_name(hit["path"]) for hit in line["topk"]]
         map_rows = [self.map_session.row_of_name.get(name, -1) for name in names]
-        images, similarity = self._similarities(row, [map_row for map_row in map_rows if map_row >= 0])
+        images, similarity = self._similarities(row, map_rows)
         overlap = self._overlaps(row, images)
         overlap_of_row = dict(zip(images.tolist(), overlap.tolist(), strict=True))
-        scores = [float(hit.get("score", np.nan)) for hit in line["topk"]]
-        references = pd.DataFrame({"rank": np.arange(1, len(names) + 1), "score": scores, "name": names})
-        references["overlap"] = [overlap_of_row.get(map_row, np.nan) for map_row in map_rows]
+        references = pd.DataFrame({
+            "rank": np.arange(1, len(names) + 1),
+            "score": [float(hit.get("score", np.nan)) for hit in line["topk"]],
+            "name": names,
+            "overlap": [overlap_of_row.get(map_row, np.nan) for map_row in map_rows],
+        })  # fmt: skip
         points = "view" if self.local_map is None else "map"
         return RetrievedQuery(
             self.session, self.map_session, number, row, references, images, similarity, overlap, points
@@ -144,42 +146,38 @@ class RetrievedPair:
         """Return the rows of posed map images in order, all `references` among them, and the query's similarities."""
         from toolkit.embedders.search import fuse  # loads FAISS
 
+        session, row_of_name = self.map_session, self.map_session.row_of_name
         queries, query_table = open_descriptors(self.embeddings, self.session.id, normalize=True)
-        vectors, table = open_descriptors(self.embeddings, self.map_session.id, normalize=True)
+        vectors, table = open_descriptors(self.embeddings, session.id, normalize=True)
         query_rows = np.flatnonzero(query_table["abs_path"].map(image_name) == self.session.image_name(row))
         if not len(query_rows):
             raise ArtifactError(f"{self.embeddings}: {self.session.image_name(row)} has no descriptor. Embed again.")
-        row_of_name = self.map_session.row_of_name
         rows = np.array([row_of_name.get(image_name(path), -1) for path in table["abs_path"]], np.int64)
         usable = np.flatnonzero(rows >= 0)
-        usable = usable[is_posed(self.map_session.world_from_cam(rows[usable]))]
-        images = self.map_session.images.iloc[rows[usable]]
-        order = np.lexsort(
-            (images["timestamp"], images["sensor_id"].astype(str), self.map_session.subsession_of(rows[usable]))
-        )
-        usable = usable[order]
-        chosen = np.zeros(len(usable), bool)
-        chosen[:: max(1, -(-len(usable) // MOST))] = True
-        usable = usable[chosen | np.isin(rows[usable], references)]
-        cuts = np.cumsum(vectors.dims)[:-1]
+        usable = usable[is_posed(session.world_from_cam(rows[usable]))]
+        images = session.images.iloc[rows[usable]]
+        taken = images["timestamp"], images["sensor_id"].astype(str), session.subsession_of(rows[usable])
+        usable = usable[np.lexsort(taken)]
+        sampled = np.arange(len(usable)) % max(1, -(-len(usable) // MAX_COMPARED)) == 0
+        usable = usable[sampled | np.isin(rows[usable], references)]
+        cuts, ascending = np.cumsum(vectors.dims)[:-1], np.sort(usable)
         query = np.split(queries[query_rows[:1]], cuts, axis=1)
-        parts = np.split(vectors[np.sort(usable)], cuts, axis=1)
+        parts = np.split(vectors[ascending], cuts, axis=1)
         products = [part @ one[0] for part, one in zip(parts, query, strict=True)]
         values = np.asarray(products[0] if len(products) == 1 else fuse(products), np.float64)
-        return rows[usable], values[np.argsort(np.argsort(usable))]
+        return rows[usable], values[np.searchsorted(ascending, usable)]
 
     def _overlaps(self, row: int, images: Ints) -> Floats:
         """Return the overlap of map images with a query image; NaN without its true pose."""
         pose = self.session.world_from_cam([row], ground_truth=True)[0]
         if not is_posed(pose):
             return np.full(len(images), np.nan)
-        camera = self.session.camera(str(self.session.images["sensor_id"].iloc[row]))
-        shares, sensors = [], self.map_session.images["sensor_id"]
-        for image, of_map in zip(images.tolist(), self.map_session.world_from_cam(images), strict=True):
-            reference = {"path": self.map_session.image_name(image), "sensor_id": sensors.iloc[image], "Tws": of_map}
-            seen = seen_by(reference, self.map_session, self.local_map)
-            shares.append(overlap_in_view(seen, of_map[:3, 3], pose, camera))
-        return np.array(shares)
+        session, camera = self.map_session, self.session.cameras([row])[0]
+        sensors, poses = session.images["sensor_id"].iloc[images], session.world_from_cam(images)
+        names = [session.image_name(int(image)) for image in images]
+        of_images = zip(names, sensors, poses, strict=True)
+        shown = ({"path": name, "sensor_id": sensor, "Tws": of_map} for name, sensor, of_map in of_images)
+        return np.array([overlap_of(image, session, self.local_map, pose, camera) for image in shown])
 
 
 @styled
@@ -189,46 +187,38 @@ def draw_retrieved(query: RetrievedQuery) -> "Figure":
     With a true pose, images that overlap with the query are green, and references that do not are orange.
     """
     count, session, map_session = len(query.references), query.session, query.map_session
-    rows = max(1, -(-count // IN_ROW))
+    rows = max(1, -(-count // MAX_IN_ROW))
     figure = new_figure(11, 1.75 * rows + 4.6)
     strip, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[1.75 * rows + 0.3, 4.3])[:, 0]
     rows_of_map = [map_session.row_of_name.get(name) for name in query.references["name"]]
-    ratios = [_ratio(map_session, row) for row in rows_of_map if row is not None]
-    axis, panels = query_and_references(strip, count, rows, _ratio(session, query.row), max(ratios, default=1.0))
+    of_map = map_session.cameras([row for row in rows_of_map if row is not None])
+    (ratio,), ratios = ([one.width / one.height for one in each] for each in (session.cameras([query.row]), of_map))
+    axis, panels = query_and_references(strip, count, rows, ratio, max(ratios, default=1.0))
     draw_image(axis, session.image_path(query.row), 2.4 * rows, "query", frame="black")
     for panel, hit, row in zip(panels, query.references.itertuples(), rows_of_map, strict=True):
-        known, good = np.isfinite(hit.overlap), hit.overlap >= LEAST_OVERLAP
+        known, good = np.isfinite(hit.overlap), hit.overlap >= MIN_OVERLAP
         text = f"{hit.rank}: {hit.score:.2f}" + (f", overlap {hit.overlap:.0%}" if known else "")
         color = (GREEN if good else ORANGE) if known else GRAY
         image = np.full((3, 4, 3), 230, np.uint8) if row is None else map_session.image_path(row)
         draw_image(panel, image, 2.4, text if row is not None else f"{text}, not in the capture", color, color)
     along, above = below.subplots(1, 2, width_ratios=[1.6, 1.0])
-    _draw_along(along, query)
-    _draw_from_above(above, query)
+    good = query.overlap >= MIN_OVERLAP
+    retrieved = np.isin(query.images, [row for row in rows_of_map if row is not None])
+    _draw_along(along, query, good, retrieved)
+    _draw_from_above(above, query, good, retrieved)
     shared_legend(below, (along, above), ncols=4)
     points = "the map points" if query.points == "map" else "points laid into the views"
     title = f"query image {query.number}: {shown_name(query.name)}"
     if query.is_known:
-        title += f"\ngreen: overlaps with the query by the true pose and {points} ({LEAST_OVERLAP:.0%} of them in view)"
+        title += f"\ngreen: overlaps with the query by the true pose and {points} ({MIN_OVERLAP:.0%} of them in view)"
     figure.suptitle(title, fontsize=10)
     return figure
 
 
-def _ratio(session: Session, row: int) -> float:
-    """Return width by height of an image."""
-    camera = session.camera(str(session.images["sensor_id"].iloc[row]))
-    return float(camera.width / camera.height)
-
-
-def _overlap_and_retrieved(query: RetrievedQuery) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which of the images overlap with the query, and which are references."""
-    rows = [query.map_session.row_of_name.get(name, -1) for name in query.references["name"]]
-    return query.overlap >= LEAST_OVERLAP, np.isin(query.images, rows)
-
-
-def _draw_along(axis: "Axes", query: RetrievedQuery) -> None:
+def _draw_along(
+    axis: "Axes", query: RetrievedQuery, good: NDArray[np.bool_], retrieved: NDArray[np.bool_]
+) -> None:
     """Draw the similarity of the query to the map images, in the order that they were taken."""
-    good, retrieved = _overlap_and_retrieved(query)
     x = np.arange(len(query.images))
     if query.is_known:
         axis.scatter(x[good], query.similarity[good], s=16, c=GREEN, lw=0, zorder=3, label="overlaps with the query")
@@ -249,10 +239,11 @@ def _draw_along(axis: "Axes", query: RetrievedQuery) -> None:
     axis.set_title("similarity along the map", fontsize=9)
 
 
-def _draw_from_above(axis: "Axes", query: RetrievedQuery) -> None:
+def _draw_from_above(
+    axis: "Axes", query: RetrievedQuery, good: NDArray[np.bool_], retrieved: NDArray[np.bool_]
+) -> None:
     """Draw the positions of the map images, the references and, if known, the query."""
     poses, true = query.map_session.world_from_cam(query.images), query.session.world_from_cam([query.row], True)
-    good, retrieved = _overlap_and_retrieved(query)
     layers = [
         Layer(poses[~good], None, "0.6" if query.is_known else MAP, s=9, lw=0),
         Layer(poses[good], None, GREEN, s=16, lw=0),

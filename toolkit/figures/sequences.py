@@ -19,17 +19,7 @@ from toolkit.figures.style import GREEN, ORANGE, SKY, VERMILLION, new_figure, pe
 from toolkit.figures.top_view import Ground, Layer, draw_places
 from toolkit.files import pair_name, require_current, require_whole
 from toolkit.geometry import Floats
-from toolkit.results.metrics import (
-    WRONG,
-    Threshold,
-    is_below,
-    is_posed,
-    parse_threshold,
-    pose_errors,
-    recall,
-    threshold_name,
-    unit_of,
-)
+from toolkit.results.metrics import WRONG, Threshold, is_below, is_posed, pose_errors, summary_of, threshold_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,26 +59,26 @@ class SequencePair:
         """The poses of the frames."""
         return self.stem.with_name(f"{self.stem.name}_sequence.txt")
 
-    def _path(self, end: str) -> Path:
+    def _whole(self, end: str) -> Path:
         """Return a file of the pair; raise ArtifactError if it is damaged."""
         path = self.stem.with_name(self.stem.name + end)
-        require_whole(path, of=None if end == ".txt" else self.stem.with_name(f"{self.stem.name}_sequence.txt"))
+        require_whole(path, of=None if end == ".txt" else self.path)
         return path
 
     @cached_property
     def frames(self) -> pd.DataFrame:
         """One row per frame, see `sequence.COLUMNS`."""
-        return read_query_table(self._path("_sequence.csv"), ["recording", "piece", "used"])
+        return read_query_table(self._whole("_sequence.csv"), ["recording", "piece", "used"])
 
     @cached_property
     def steps(self) -> dict[str, Trajectory]:
         """Query poses after each step: `single`, the steps that the stage wrote, and `sequence`."""
-        steps = {SINGLE: Trajectory.read(self._path(".txt"))}
-        if (path := self._path("_sequence_steps.csv")).is_file():
+        steps = {SINGLE: Trajectory.read(self._whole(".txt"))}
+        if (path := self._whole("_sequence_steps.csv")).is_file():
             for name, rows in read_query_table(path, ["step", *POSE_NAMES]).groupby("step", sort=False):
                 qt = rows[list(POSE_NAMES)].to_numpy(float)
                 steps[str(name)] = Trajectory(rows["timestamp"].to_numpy(np.int64), as_strings(rows["device_id"]), qt)
-        return {**steps, SEQUENCE: Trajectory.read(self._path("_sequence.txt"))}
+        return {**steps, SEQUENCE: Trajectory.read(self._whole("_sequence.txt"))}
 
     def odometry_tracks(self, session: Session) -> list[Floats]:
         """Return the positions (n, 3) of each piece of odometry, rigidly placed in the map by the step `voted`."""
@@ -144,16 +134,9 @@ class SequencePair:
             translation = translation / length
             within = is_below(rotation_deg, translation, limits[-1])
             first = within if first is None else first
-            shares = recall(rotation_deg, translation, limits)
-            rows.append({
-                "step": step,
-                "queries": len(keys),
-                **{f"recall@{threshold_name(t, unit)}": share for t, share in zip(limits, shares, strict=True)},
-                "median_rotation_deg": float(np.median(rotation_deg)),
-                "median_translation_m": float(np.median(translation)),
-                "rescued": int((within & ~first).sum()),
-                "broken": int((first & ~within).sum()),
-            })  # fmt: skip
+            counts = {"rescued": int((within & ~first).sum()), "broken": int((first & ~within).sum())}
+            summary = summary_of(rotation_deg, translation, limits, unit)
+            rows.append({"step": step, "queries": len(keys), **summary, **counts})
         return rows
 
 
@@ -238,8 +221,7 @@ def draw_steps(table: pd.DataFrame) -> "Figure":
         for x, mean in enumerate(means):
             plot.text(x, 3, percent(mean / 100), ha="center", fontsize=8)
         plot.set_xticks(range(len(steps)), steps, rotation=45, ha="right")
-        degrees, length = parse_threshold(column)
-        plot.set_title(f"recall @ {degrees:g}°, {length:g} {unit_of(column)}", fontsize=10)
+        plot.set_title(f"recall @ {threshold_text(column)}", fontsize=10)
     plots[0].set_ylabel("queries [%]")
     figure.suptitle("Recall after each step: mean of all pairs (bars), each pair (dots)")
     return figure

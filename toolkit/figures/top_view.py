@@ -5,16 +5,19 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.world_up import up_of_cameras
-from toolkit.figures.style import new_figure
+from toolkit.figures.style import ESTIMATED, MAP, TRUE, error_bar, error_colors, new_figure, shared_legend, styled
 from toolkit.geometry import Floats, Ints
+from toolkit.results.metrics import is_posed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+MAX_POINTS = 60_000
+"""Points in the map of `draw_scene`, at most: a regular sample."""
 MAX_PLACES = 6
 """Panels of a figure, at most: the places with the most cameras."""
 
@@ -159,14 +162,79 @@ def draw_places(
     return figure, places, list(zip(axes, shown.tolist(), windows, strict=False))
 
 
-def ground_axes(up: ArrayLike, unit: str | None = "m") -> tuple[Floats, list[str]]:
-    """Return the right and the upward axis of a picture from above, (2, 3), and their labels.
-
-    If `up` is a world axis, the two are world axes, so the picture shows world coordinates.
+@styled
+def draw_scene(
+    points: Floats,
+    colors: NDArray[np.uint8] | None,
+    map_poses: ArrayLike,
+    estimated: Floats,
+    true: Floats,
+    up: ArrayLike | None = None,
+    title: str = "Queries in the map, seen from above",
+    map_tracks: Sequence[Floats] = (),
+    query_tracks: Sequence[Floats] = (),
+    unit: tuple[str, float] = ("m", 1.0),
+) -> "Figure":
+    """Draw the map from above with estimated and true query poses, one panel per place; return the figure.
 
     Args:
-        up: up direction (3,).
-        unit: unit of the coordinates, None if unknown.
+        points: (P, 3), meters.
+        colors: (P, 3) RGB, or None.
+        map_poses: world_from_cam (N, 4, 4) of the map; NaN rows are skipped.
+        estimated: world_from_cam (Q, 4, 4) of the queries, NaN without a pose.
+        true: true world_from_cam (Q, 4, 4) of the queries, NaN where unknown.
+        up: up direction (3,); None: estimated from the map's cameras.
+        map_tracks: tracks of the map devices, (n, 3) each, drawn as lines.
+        query_tracks: true tracks of the query devices.
+        unit: unit that lengths are shown in, see `metrics.length_unit`.
+    """
+    from matplotlib.collections import LineCollection
+
+    map_poses = np.asarray(map_poses, np.float64)
+    map_poses = map_poses[is_posed(map_poses)]
+    ground, step = Ground.below(map_poses, up, unit), len(points) // MAX_POINTS + 1
+    points = points[::step]
+    # Darker colors: small bright points would vanish on white.
+    tint = "#9A9A9A" if colors is None else np.clip(colors[::step] / 255 * 0.75 + 0.2, 0, 0.75)
+    has_estimate, has_truth = is_posed(estimated), is_posed(true)
+    both, lost = has_estimate & has_truth, has_truth & ~has_estimate
+    errors = error_colors(np.linalg.norm(estimated[:, :3, 3] - true[:, :3, 3], axis=1) / unit[1]) / 255.0
+    line: dict[str, Any] = {"track": True, "lw": 0.7, "alpha": 0.5, "zorder": 2}
+    layers = [
+        Layer(points, None, tint, s=1.2, lw=0, rasterized=True),
+        *(Layer(track, "map tracks", MAP, **line) for track in map_tracks),
+        *(Layer(track, "true query tracks", TRUE, **line) for track in query_tracks),
+        Layer(map_poses, "map cameras", MAP, 0.035, s=9, lw=0, zorder=3),
+        Layer(true[both], "query, true", TRUE, hollow=True, s=52, lw=1.2, zorder=5),
+        Layer(true[lost], "query without a pose, true", ESTIMATED, s=42, marker="x", lw=1.8, zorder=6),
+        Layer(estimated[has_estimate], "query, estimated; a line joins it to its true position", errors[has_estimate],
+              0.035, s=16, lw=0, zorder=5),
+    ]  # fmt: skip
+    anchors = np.where(has_truth[:, None, None], true, estimated)
+    figure, places, panels = draw_places(ground, layers, map_poses, points, anchors)
+    centers = ground.flat(estimated)
+    joins = np.stack([centers, ground.flat(true)], axis=1)
+    of_place = places.nearest(ground.flat(anchors))
+    for axis, place, (low, high) in panels:
+        here = of_place == place
+        joined = both & here
+        axis.add_collection(LineCollection(list(joins[joined]), colors=errors[joined], linewidths=1.6, zorder=4))
+        name = f"place {place + 1}: " if places.numbers.any() else ""
+        outside = int((((centers < low) | (centers > high)).any(axis=1) & here).sum())
+        far = f", {outside} estimated outside the picture" if outside else ""
+        axis.set_title(f"{name}{(has_estimate & here).sum()} of {here.sum()} queries have a pose{far}", fontsize=9)
+    axes = [axis for axis, _, _ in panels]
+    if both.any():
+        error_bar(figure, unit[0], ax=axes, shrink=0.8)
+    shared_legend(figure, axes, ncols=5, frameon=False, fontsize=9)
+    figure.suptitle(title)
+    return figure
+
+
+def ground_axes(up: ArrayLike, unit: str | None = "m") -> tuple[Floats, list[str]]:
+    """Return the right and the upward axis of a figure from above, (2, 3), and their labels.
+
+    If `up`, (3,), is a world axis, the two are world axes, so the figure shows world coordinates.
     """
     up = np.asarray(up, np.float64) / np.linalg.norm(up)
     axis = int(np.argmax(np.abs(up)))
@@ -190,9 +258,7 @@ def places_of(positions: Floats) -> Ints:
     from scipy.cluster.hierarchy import fcluster, linkage
     from scipy.spatial import cKDTree
 
-    if len(positions) < 2:
-        return np.zeros(len(positions), np.int64)
-    extent = float(np.linalg.norm(np.ptp(positions, axis=0)))
+    extent = float(np.linalg.norm(np.ptp(positions, axis=0))) if len(positions) else 0.0
     # Merge positions on one spot (cameras of a rig), which would bias the step; about a thousand spots suffice.
     spots = np.unique(np.round(positions / max(extent / 400, 1e-9)), axis=0) * max(extent / 400, 1e-9)
     spots = spots[:: len(spots) // 1500 + 1]

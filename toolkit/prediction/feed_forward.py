@@ -74,6 +74,10 @@ class FeedForwardAnswer:
     cameras: tuple[CameraAnswer, ...] = ()
 
 
+_Groups = tuple[list[list[Ints]], dict[tuple[int, int], list[View]]]
+"""References chosen for each image of each query, and groups of views, keyed by query and image."""
+
+
 class FeedForwardLocalizer(Localizer):
     """Localizes queries in one map by predicted cameras."""
 
@@ -103,6 +107,8 @@ class FeedForwardLocalizer(Localizer):
         self._length = length
         self._upright = turns is not None
         self._turns = np.zeros(len(session.images), np.int64) if turns is None else turns.of(session)
+        self._next: tuple[Sequence[QueryInput], _Groups] = (), ([], {})
+        """Queries expected in the next call of `predict`, and their groups."""
         self.image_names, self.batch_size = local_map.image_names, self.settings.batch_size
 
     @fixed_sums
@@ -137,14 +143,12 @@ class FeedForwardLocalizer(Localizer):
             Exception: a problem of all queries: the device does not exist, the weights are of another network, or the
                 memory is too small; see `errors.reason_of`.
         """
-        chosen = [[self._choose(retrieved) for retrieved in references] for _, references in queries]
-        groups = {
-            (number, camera): [self._as_shown(query.views[camera]), *(self.view(int(index)) for index in references)]
-            for number, (query, _) in enumerate(queries)
-            for camera, references in enumerate(chosen[number])
-            if len(references)
-        }
-        predictions = dict(zip(groups, self._predict(list(groups.values())), strict=True))
+        expected, expected_groups = self._next
+        chosen, groups = expected_groups if queries is expected else self._groups(queries)
+        next_groups = self._groups(following)
+        self._next = following, next_groups
+        results = self._predict(list(groups.values()), list(next_groups[1].values()))
+        predictions = dict(zip(groups, results, strict=True))
         return [
             QueryPrediction(
                 tuple(references),
@@ -152,6 +156,16 @@ class FeedForwardLocalizer(Localizer):
             )
             for number, references in enumerate(chosen)
         ]
+
+    def _groups(self, queries: Sequence[QueryInput]) -> _Groups:
+        chosen = [[self._choose(retrieved) for retrieved in references] for _, references in queries]
+        groups = {
+            (number, camera): [self._as_shown(query.views[camera]), *(self.view(int(index)) for index in references)]
+            for number, (query, _) in enumerate(queries)
+            for camera, references in enumerate(chosen[number])
+            if len(references)
+        }
+        return chosen, groups
 
     def _as_shown(self, view: View) -> View:
         return view if self._upright else replace(view, turns=0)
@@ -182,10 +196,10 @@ class FeedForwardLocalizer(Localizer):
         )
         return candidates[chosen]
 
-    def _predict(self, groups: list[list[View]]) -> list[Prediction | str]:
+    def _predict(self, groups: list[list[View]], following: Sequence[list[View]] = ()) -> list[Prediction | str]:
         """Return a prediction per group, or the reason why there is none."""
         try:
-            return [*self.predictor.predict(groups)] if groups else []
+            return [*self.predictor.predict(groups, following)] if groups else []
         except Exception as error:  # one bad query must not end a run; the groups are tried one by one
             if len(groups) == 1:
                 return [reason_of(error, f"predicting {groups[0][0].name}")]

@@ -27,7 +27,7 @@ class HybridLocalizer(Localizer):
 
     def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[QueryPrediction]:
         """Return the prediction of the network for each query; see `Localizer`."""
-        return self.feed_forward.predict(queries)
+        return self.feed_forward.predict(queries, following)
 
     def match(self, query: Query, references: Sequence[References]) -> PnpMatches:
         """Return the matches of a query with its references; see `Localizer`."""

@@ -3,7 +3,9 @@
 import logging
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property, partial
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +29,8 @@ from toolkit.prediction.simulated import SimulatedPredictor
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
+
+    _Begun = dict[Any, Future[Tensor | ImageError]]
 
 log = logging.getLogger(__name__)
 
@@ -128,6 +132,8 @@ class NetworkPredictor:
         self._cache = TokenCache(cache_bytes)
         self._fitting: dict[tuple[int, Size], Fitting] = {}
         self._most_views: dict[Size, int] = {}
+        self._begun: _Begun = {}
+        """Images of the next call that are being decoded, by key."""
 
     @cached_property
     def settings(self) -> dict[str, Any]:
@@ -151,7 +157,7 @@ class NetworkPredictor:
     def _model(self) -> Any:
         return _load_network(self._architecture, self.checkpoint, self._dtype, self._device, self._compile)
 
-    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
         """Return a prediction for each group of views. The first view of a group is the query.
 
         A prediction has as many views as its group. Views that the network did not get have NaN in `model_from_cams`
@@ -164,11 +170,14 @@ class NetworkPredictor:
         No other error is raised for a group, and groups do not influence each other. Groups with equal numbers of views
         and equal image size run in one batch. A batch that does not fit the memory is halved.
 
+        The first images of the `following` groups, those of the next call, are decoded while the network runs.
+
         Raises:
             WeightsError: at the first call, the file does not belong to this network.
             ToolkitError: the device does not exist, or its memory does not hold a query and one reference.
         """
         placed = [self._place(group) if group else [] for group in groups]
+        begun, self._begun = self._begun, self._read_ahead(placed, following)
         results = [_nothing(len(group)) for group in groups]
         alike: dict[tuple[int, Size], list[int]] = {}
         for number, group in enumerate(placed):
@@ -177,7 +186,7 @@ class NetworkPredictor:
         batch_size = self._batch_size or (1 if self._device.type == "cpu" else _GROUPS_AT_A_TIME)
         for numbers in alike.values():
             batches = [numbers[start : start + batch_size] for start in range(0, len(numbers), batch_size)]
-            encoded = self._encoded([[placed[number] for number in batch] for batch in batches])
+            encoded = self._encoded([[placed[number] for number in batch] for batch in batches], begun)
             for batch, tokens in zip(batches, encoded, strict=True):
                 self._run(batch, [placed[number] for number in batch], tokens, results)
         return results
@@ -187,14 +196,31 @@ class NetworkPredictor:
         layout = self._architecture.lay_out([shown_size(view) for view in group])
         return [PlacedView(view, layout, number) for number, view in enumerate(group)]
 
-    def _encoded(self, batches: Sequence[Sequence[Sequence[PlacedView]]]) -> "Iterator[dict[Any, Tensor | str]]":
+    def _read_ahead(self, groups: Sequence[list[PlacedView]], following: Sequence[Sequence[View]]) -> "_Begun":
+        """Start to decode the first images of the following groups, except those whose encoding will be cached."""
+        encoded = {placed.key for group in groups for placed in group if placed.view.in_map}
+        views = {placed.key: placed for group in following if group for placed in self._place(group)}
+        new = (key for key in views if isinstance(key[0], Path) and key not in encoded and key not in self._cache)
+        pool = ThreadPoolExecutor(workers := default_workers())
+        begun = {key: pool.submit(self._read, views[key]) for key in islice(new, workers + _IMAGES_AT_A_TIME)}
+        pool.shutdown(wait=False)
+        return begun
+
+    def _encoded(
+        self, batches: Sequence[Sequence[Sequence[PlacedView]]], begun: "_Begun"
+    ) -> "Iterator[dict[Any, Tensor | str]]":
         """Yield, per batch, the tokens (P, C) of its views by key, or the reason why a view cannot be read.
 
         Other threads decode the next images in the meantime, except those whose encoding is cached.
         """
+
+        def read(placed: PlacedView) -> "Tensor | ImageError":
+            future = begun.pop(placed.key, None)
+            return future.result() if future else self._read(placed)
+
         views = {placed.key: placed for batch in batches for group in batch for placed in group}
         unread = {key: placed for key, placed in views.items() if key not in self._cache}
-        decoded = prefetch(self._read, list(unread.values()), workers=default_workers(), ahead=_IMAGES_AT_A_TIME)
+        decoded = prefetch(read, list(unread.values()), workers=default_workers(), ahead=_IMAGES_AT_A_TIME)
         for batch in batches:
             tokens: dict[Any, Tensor | str] = {}
             waiting: dict[Any, tuple[PlacedView, Tensor]] = {}

@@ -96,7 +96,7 @@ class SimulatedPredictor:
             for name, pose in zip(session.image_names, session.world_from_cam(ground_truth=True), strict=True)
         }
 
-    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
         """Return a prediction for each group of views.
 
         Raises:

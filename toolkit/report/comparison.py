@@ -4,7 +4,7 @@ Everything is read from the files of the runs; no query is localized again.
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -18,12 +18,12 @@ from toolkit.capture.devices import extra_devices
 from toolkit.capture.names import allow_outside
 from toolkit.errors import ArtifactError, ToolkitError
 from toolkit.figures.inspection import InspectedPair
-from toolkit.figures.stills import draw_localization
+from toolkit.figures.query_images import draw_localization
 from toolkit.figures.style import BLUE, GREEN, ORANGE, SKY, VERMILLION, new_figure, number, percent, styled
 from toolkit.files import SceneFiles, require_current, require_whole
 from toolkit.geometry import Floats, Ints
-from toolkit.report.page import off_by, read_run, seconds_text, threshold_text
-from toolkit.results.metrics import is_below, named_as_meters, parse_threshold, unit_of
+from toolkit.report.page import off_by, read_run, seconds_text
+from toolkit.results.metrics import is_below, named_as_meters, parse_threshold, threshold_text, unit_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,7 +33,7 @@ INTERVAL = (2.5, 97.5)
 """Percentiles of the resamples that bound an interval."""
 ALL = "all"
 """Value of the scene and device columns in rows that sum over all pairs."""
-MOST_ROWS, MOST_LETTERS = 20, 32
+MAX_ROWS, MAX_LETTERS = 20, 32
 """Queries won or lost that are listed; letters of an image name beyond which only the file name is shown."""
 QUERY = ["scene", "map_device", "query_device", "timestamp", "device_id"]
 _PAIR = QUERY[:3]
@@ -56,8 +56,8 @@ class Comparison:
     thresholds: Sequence[str]
     """Names, such as `(1deg,0.1m)`."""
     queries: pd.DataFrame
-    """One row per common query and pair. Columns `QUERY`; `status_<i>`, `rotation_error_deg_<i>` and
-    `translation_error_m_<i>` of each run i; `image`, the image name, unless the runs are too old to have it."""
+    """One row per common query and pair. Columns `QUERY`; `image`, the image name; `status_<i>`,
+    `rotation_error_deg_<i>` and `translation_error_m_<i>` of each run i."""
     recall: pd.DataFrame
     """One row per pair, threshold and run, and the same for all pairs together: recall and its difference to the first
     run (0 to 1), each with the `_low` and `_high` of its interval; numbers of queries, won and lost."""
@@ -118,31 +118,30 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
     """
     if isinstance(run_dirs, str) or len(run_dirs) < 2:
         raise ArtifactError(f"compare: found {run_dirs!r}, expected a list of two or more run folders.")
-    folders = list(map(Path, run_dirs))
+    folders, messages = list(map(Path, run_dirs)), list[str]()
     records = [read_run(folder / "run.json") for folder in folders]
     tables = [_read_errors(folder, record) for folder, record in zip(folders, records, strict=True)]
-    names, messages = _names(folders), list[str]()
+    names = [folder.resolve().name for folder in folders]
+    names = [f"{name} ({i})" if names.count(name) > 1 else name for i, name in enumerate(names, 1)]
     limits = [[name.removeprefix("loss@") for name in table if name.startswith("loss@")] for table in tables]
-    units = [unit_of(*names_of) for names_of in limits]
-    for folder, record, unit, limit in zip(folders, records, units, limits, strict=True):
-        if unit != units[0]:
-            raise ArtifactError(
-                f"{folder}: found errors in {unit}, expected {units[0]} as in {folders[0]}. Set the same `unit` for "
-                "both, and run them again."
-            )
-        if record["status"] not in ("done", ""):
-            messages.append(f"{folder.name} is {record['status']}: {record['error'] or 'it has not ended'}")
-        if limit != limits[0]:
-            messages.append(f"{folder.name} was evaluated at other thresholds; those of {names[0]} are used.")
     keys = [*QUERY, *(["sensor_id"] if all("sensor_id" in table for table in tables) else [])]
-    for folder, table in zip(folders, tables, strict=True):
+    for folder, record, table, limit in zip(folders, records, tables, limits, strict=True):
+        if unit_of(*limit) != unit_of(*limits[0]):
+            raise ArtifactError(
+                f"{folder}: found errors in {unit_of(*limit)}, expected {unit_of(*limits[0])} as in {folders[0]}. Set "
+                "the same `unit` for both, and run them again."
+            )
         if table.duplicated(keys).any():
             raise ArtifactError(
                 f"{folder}: evaluation/errors.csv has a query twice, expected one row each. Perhaps this run was "
                 "evaluated at each camera and the others at each device; evaluate it with the same `at` as the others."
             )
+        if record["status"] not in ("done", ""):
+            messages.append(f"{folder.name} is {record['status']}: {record['error'] or 'it has not ended'}")
+        if limit != limits[0]:
+            messages.append(f"{folder.name} was evaluated at other thresholds; those of {names[0]} are used.")
     results = [table.set_index(keys)[_RESULT].add_suffix(f"_{i}") for i, table in enumerate(tables)]
-    images = tables[0].set_index(keys).filter(["image"])
+    images = tables[0].set_index(keys)[["image"]]
     queries = pd.concat([images, *results], axis="columns", join="inner").reset_index()
     counts = ", ".join(f"{name} {len(table)}" for name, table in zip(names, tables, strict=True))
     if queries.empty:
@@ -154,10 +153,10 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
     for scene in queries["scene"].unique():
         if len({str(record["inputs"].get(scene)) for record in records}) > 1:
             messages.append(f"{scene}: its files were changed, moved or copied between the runs.")
-    errors = [queries[[f"{name}_{i}" for name in _ERRORS]].to_numpy(float).T for i in range(len(tables))]
-    limits_of = [parse_threshold(name) for name in limits[0]]
-    hits = np.array([[is_below(turned, moved, limit) for limit in limits_of] for turned, moved in errors])
-    hits = np.moveaxis(hits, 2, 0)  # (Q, R, T), whether each query is within each threshold in each run
+    hits = np.zeros((len(queries), len(tables), len(limits[0])), bool)
+    for i, k in np.ndindex(hits.shape[1:]):
+        turned, moved = queries[[f"{name}_{i}" for name in _ERRORS]].to_numpy(float).T
+        hits[:, i, k] = is_below(turned, moved, parse_threshold(limits[0][k]))
     return Comparison(
         *(folders, names, records, limits[0], queries),
         _recall(queries, hits, names, limits[0], seed, resamples),
@@ -198,45 +197,32 @@ def bootstrap(
 
 def _read_errors(folder: Path, record: Mapping[str, Any]) -> pd.DataFrame:
     """Return the errors of all queries with ground truth of all scenes of a run, with a column `scene`."""
-    tables, missing = [], []
-    for scene in map(str, record["scenes"]):
-        path = SceneFiles(folder, scene).evaluation / "errors.csv"
+    paths = {scene: SceneFiles(folder, scene).evaluation / "errors.csv" for scene in map(str, record["scenes"])}
+    tables, types = [], {"timestamp": np.int64, "device_id": str, "sensor_id": str, "status": str}
+    for scene, path in paths.items():
         if not path.is_file():
-            missing.append(str(path))
             continue
         require_whole(path, of=path.with_name("recall.csv"))
         require_current(path.with_name("recall.csv"), "evaluate")
         try:
-            types = {"timestamp": np.int64, "device_id": str, "sensor_id": str, "status": str}
-            table = pd.read_csv(path, dtype={**types, **dict.fromkeys(_ERRORS, float)})
+            table = named_as_meters(pd.read_csv(path, dtype={**types, **dict.fromkeys(_ERRORS, float)}))
         except (OSError, ValueError, OverflowError) as error:
             raise ArtifactError(f"{path}: not a table of errors ({error}). Run its stage evaluate again.") from None
-        table = named_as_meters(table)
-        if lacking := [name for name in (*QUERY[1:], *_RESULT) if name not in table]:
-            raise ArtifactError(f"{path}: column {lacking[0]!r} is missing. Run its stage evaluate again.")
-        if not any(name.startswith("loss@") for name in table):
-            raise ArtifactError(f"{path}: a column `loss@...`, which names a threshold, is missing. Evaluate again.")
+        lacking = [name for name in (*QUERY[1:], "image", *_RESULT) if name not in table]
+        if lacking or not any(name.startswith("loss@") for name in table):
+            name = (lacking or ["loss@<threshold>"])[0]
+            raise ArtifactError(f"{path}: column {name!r} is missing. Run its stage evaluate again.")
         tables.append(table.assign(scene=scene))
     if not tables:
-        raise ArtifactError(
-            f"{folder}: not evaluated ({missing[0]} is missing). Finish the run: python -m toolkit run MANIFEST."
-            if missing
-            else f"{folder}: found no scene in run.json, expected the scenes of a run. Run its manifest again."
-        )
-    errors = pd.concat(tables, ignore_index=True)
-    errors = errors[errors[_ERRORS].notna().all(axis=1)]
+        missing = f"{next(iter(paths.values()))} is missing" if paths else "its run.json names no scene"
+        raise ArtifactError(f"{folder}: not evaluated ({missing}). Finish the run: python -m toolkit run MANIFEST.")
+    errors = pd.concat(tables, ignore_index=True).dropna(subset=_ERRORS)
     if errors.empty:
         raise ArtifactError(
             f"{folder}: found no query with ground truth, expected at least one: recall needs true poses. Add ground "
             "truth to the query sessions and evaluate again."
         )
     return errors
-
-
-def _names(folders: Sequence[Path]) -> list[str]:
-    """Return a short, unique name for each run."""
-    names = [folder.resolve().name for folder in folders]
-    return [f"{name} ({i})" if names.count(name) > 1 else name for i, name in enumerate(names, 1)]
 
 
 # Counting
@@ -308,15 +294,12 @@ def _resources(stages: Mapping[str, Sequence[Mapping[str, Any]]]) -> pd.DataFram
 @styled
 def draw_differences(comparison: Comparison) -> "Figure":
     """Draw for each pair the difference of recall to the first run, with its interval."""
-    others = comparison.names[1:]
-    table = comparison.recall[comparison.recall["run"] != comparison.names[0]]
-    pairs = list(dict.fromkeys(map(tuple, table[_PAIR].to_numpy())))
+    others, table = comparison.names[1:], comparison.recall
+    pairs = list(table.groupby(_PAIR, sort=False).groups)
     several = table["scene"].nunique() > 2
-    labels = [
-        "all pairs" if pair[0] == ALL else f"{f'{pair[0]}: ' * several}{pair[2]} in {pair[1]} map" for pair in pairs
-    ]
+    labels = ["all pairs" if m == ALL else f"{f'{scene}: ' * several}{q} in {m} map" for scene, m, q in pairs]
     figure = new_figure(3.6 * len(comparison.thresholds) + 1.5, 0.24 * len(pairs) * max(2, len(others)) + 1.4)
-    panels = np.ravel(figure.subplots(1, len(comparison.thresholds), sharey=True, sharex=True, squeeze=False))
+    panels = figure.subplots(1, len(comparison.thresholds), sharey=True, sharex=True, squeeze=False)[0]
     for panel, threshold in zip(panels, comparison.thresholds, strict=True):
         for k, run in enumerate(others):
             rows = table[(table["run"] == run) & (table["threshold"] == threshold)]
@@ -357,10 +340,13 @@ def readable(comparison: Comparison) -> dict[str, pd.DataFrame]:
 def _readable_recall(comparison: Comparison) -> pd.DataFrame:
     """List recall in %, with its interval, and the differences in percentage points, one threshold after the other."""
     table = pd.concat(of_limit for _, of_limit in comparison.recall.groupby("threshold", sort=False))
-    rows = table.to_dict("records")
-    table["at"], table["recall"] = table["threshold"].map(threshold_text), [_interval(row, "recall") for row in rows]
-    table["difference"] = [_interval(row, "difference") for row in rows]
-    changes = ["difference", "won", "lost"]  # the first run is compared with itself
+    rows, changes = table.to_dict("records"), ["difference", "won", "lost"]
+    table = table.assign(
+        at=table["threshold"].map(threshold_text),
+        recall=[_interval(row, "recall", percent) for row in rows],
+        difference=[_interval(row, "difference", _signed) for row in rows],
+    )
+    # The first run is compared with itself.
     table[changes] = table[changes].astype(object).where(table["run"] != comparison.names[0], "")
     index = ["at", *(["scene"] if table["scene"].nunique() > 2 else []), "map", "query", "run"]
     table = table.rename(columns={"map_device": "map", "query_device": "query"}).set_index(index)
@@ -368,21 +354,16 @@ def _readable_recall(comparison: Comparison) -> pd.DataFrame:
 
 
 def _readable_changes(comparison: Comparison) -> pd.DataFrame:
-    """List the queries won and lost, or a regular sample of `MOST_ROWS` of them."""
+    """List the queries won and lost, or a regular sample of `MAX_ROWS` of them."""
     table, unit = comparison.changes, unit_of(*comparison.thresholds)
-    rows = table.loc[_spread(range(len(table)), MOST_ROWS)].to_dict("records")
-    numbers = [comparison.names.index(row["run"]) for row in rows]
-    shown = pd.DataFrame({
-        "run": [row["run"] for row in rows],
-        "change": [row["change"] for row in rows],
-        "at": [_limits(comparison, row["at"]) for row in rows],
-        "query": [f"{row['query_device']} in {row['map_device']} map" for row in rows],
-        f"off in {comparison.names[0]}": [off_by(row, after="_0", unit=unit) for row in rows],
-        "off in the run": [off_by(row, after=f"_{i}", unit=unit) for i, row in zip(numbers, rows, strict=True)],
-        "status": [row[f"status_{i}"].replace("_", " ") for i, row in zip(numbers, rows, strict=True)],
-        "image": list(map(_name, rows)),
-    })  # fmt: skip
-    return shown.set_index("run")
+    columns = ["run", "change", "at", "query", f"off in {comparison.names[0]}", "off in the run", "status", "image"]
+    rows = []
+    for row in table.loc[_spread(range(len(table)), MAX_ROWS)].to_dict("records"):
+        i, query = comparison.names.index(row["run"]), f"{row['query_device']} in {row['map_device']} map"
+        off = (off_by(row, after=f"_{k}", unit=unit) for k in (0, i))
+        status, at = row[f"status_{i}"].replace("_", " "), _limits(comparison, row["at"])
+        rows.append((row["run"], row["change"], at, query, *off, status, _name(row)))
+    return pd.DataFrame(rows, columns=columns).set_index("run")
 
 
 def draw_changes(comparison: Comparison, most: int) -> "Iterator[tuple[str, list[tuple[str, Figure]]]]":
@@ -394,17 +375,16 @@ def draw_changes(comparison: Comparison, most: int) -> "Iterator[tuple[str, list
     Args:
         most: number of queries of each run; half of them lost and half won, if there are enough of both.
     """
-    table = comparison.changes
+    table, first = comparison.changes, comparison.names[0]
     for run in comparison.names[1:]:
-        rows = [table.index[(table["run"] == run) & (table["change"] == change)].tolist() for change in ("lost", "won")]
-        half = max(most // 2, most - len(rows[1]))
-        lost = _spread(rows[0], half)
-        for row in [*lost, *_spread(rows[1], most - len(lost))]:
+        lost, won = (table.index[(table["run"] == run) & (table["change"] == change)] for change in ("lost", "won"))
+        lost_rows = _spread(lost, max(most // 2, most - len(won)))
+        for row in [*lost_rows, *_spread(won, most - len(lost_rows))]:
             change = table.loc[row].to_dict()
             query = f"{change['query_device']} query {_name(change)}"
             outcome = f"{change['change']} by {run} at {_limits(comparison, change['at'])}"
             try:
-                drawn = [_draw_query(comparison, change, name) for name in (comparison.names[0], run)]
+                drawn = [_draw_query(comparison, change, name) for name in (first, run)]
                 yield f"{query} in the {change['map_device']} map: {outcome}", drawn
             except (ToolkitError, OSError) as error:
                 yield f"No picture of {query}: {error}", []
@@ -417,19 +397,17 @@ def _draw_query(comparison: Comparison, query: Mapping[str, Any], run: str) -> "
     with extra_devices(manifest.get("extra_devices", [])), allow_outside(manifest.get("allow_outside", False)):
         pair = InspectedPair(query["map_device"], query["query_device"], files.poses_dir).localized
         table = pair.results.table
-        same = (table["timestamp"] == query["timestamp"]) & (table["device_id"] == query["device_id"])
-        if not same.any():
+        rows = np.flatnonzero((table["timestamp"] == query["timestamp"]) & (table["device_id"] == query["device_id"]))
+        if not len(rows):
             raise ArtifactError(f"{files.poses_dir / pair.name}.csv: no row of query {query['timestamp']}.")
-        k = int(np.flatnonzero(same)[0])
-        title = f"{run}: {table['status'].iloc[k]}"
-        return title, draw_localization(pair.details(k), title=title, unit=pair.results.unit)
+        title = f"{run}: {table['status'].iloc[rows[0]]}"
+        return title, draw_localization(pair.details(int(rows[0])), title=title, unit=pair.results.unit)
 
 
 def _name(change: Mapping[str, Any]) -> str:
-    """Return the name of a query: its image name, shortened to the file name if long; else its timestamp."""
-    image = change.get("image")
-    name = image if isinstance(image, str) else str(change["timestamp"])
-    return name if len(name) <= MOST_LETTERS else f"…/{name.rpartition('/')[2]}"
+    """Return the image name of a query; only the file name if it is long."""
+    name = str(change["image"])
+    return name if len(name) <= MAX_LETTERS else f"…/{name.rpartition('/')[2]}"
 
 
 def _spread(rows: Sequence[int], most: int) -> list[int]:
@@ -448,8 +426,7 @@ def _signed(share: float) -> str:
     return f"{'+' if share > 0 else '−' if share < 0 else ''}{percent(abs(share))}"
 
 
-def _interval(row: Mapping[str, Any], name: str) -> str:
-    write = _signed if name == "difference" else percent
+def _interval(row: Mapping[Any, Any], name: str, write: Callable[[float], str]) -> str:
     return f"{write(row[name])} [{write(row[f'{name}_low'])}, {write(row[f'{name}_high'])}]"
 
 

@@ -17,9 +17,8 @@ from markupsafe import Markup, escape
 
 from toolkit.capture.tables import POSES_UNIT
 from toolkit.errors import ArtifactError
-from toolkit.figures.png import as_jpeg
 from toolkit.figures.sequences import CHANGES
-from toolkit.figures.style import number, percent
+from toolkit.figures.style import as_jpeg, number, percent
 from toolkit.files import (
     SceneFiles,
     of_sequence,
@@ -30,18 +29,7 @@ from toolkit.files import (
     write_text,
 )
 from toolkit.pose.result import Status, status_counts, statuses
-from toolkit.results.metrics import (
-    REASONS,
-    THRESHOLDS,
-    WRONG,
-    is_below,
-    length_unit,
-    named_as_meters,
-    parse_threshold,
-    small_unit,
-    unit_of,
-    worst_first,
-)
+from toolkit.results import metrics
 from toolkit.results.pair import PairResults, pairs_of
 
 Write = Callable[[Any], str]
@@ -50,7 +38,7 @@ PICTURE_BUDGET = 7_000_000
 """Bytes of all pictures of a page. Base64 makes them a third larger, so the page stays below 10 MB."""
 MAX_WIDTH = 1600
 """Width of an embedded picture, pixels, at most."""
-WORST, MOST_REASONS = 10, 12
+WORST, MAX_REASONS = 10, 12
 """Rows listed for a scene: the worst queries, and the reasons why queries have no pose."""
 LONG = 30
 """Letters from which the text of a table is wrapped."""
@@ -159,9 +147,9 @@ def read_run(path: Path) -> dict[str, Any]:
     lists: dict[str, Any] = {"manifest": {}, "versions": {}, "machine": {}, "inputs": {}, "scenes": [], "stages": []}
     run = {**empty, "peak_memory_mb": None, "work_seconds": None, "code": "", **lists, **content}
     wrong = [key for key, value in lists.items() if not isinstance(run[key], type(value))]
-    if wrong or not all(isinstance(row, dict) for row in run["stages"]):
-        key = wrong[0] if wrong else "stages"
-        raise ArtifactError(f"{path}: {key!r} is not as a run writes it. Run the manifest again.")
+    wrong += [] if wrong or all(isinstance(row, dict) for row in run["stages"]) else ["stages"]
+    if wrong:
+        raise ArtifactError(f"{path}: {wrong[0]!r} is not as a run writes it. Run the manifest again.")
     run["scenes"] = run["scenes"] or list(dict.fromkeys(row["scene"] for row in run["stages"] if row.get("scene")))
     return run
 
@@ -176,16 +164,14 @@ def _json(value: Any) -> str:
 def _summary(run: dict[str, Any]) -> list[tuple[str, str]]:
     parts = [("started", str(run["created"]).replace("T", " ").replace("+00:00", " UTC"))]
     if run["total_seconds"] is not None:
-        work = run["work_seconds"]
-        detail = f" ({seconds_text(work)} of work besides the notebooks' start-up)" if work is not None else ""
-        parts.append(("time", seconds_text(run["total_seconds"]) + detail))
+        work = f" ({seconds_text(run['work_seconds'])} of work besides the notebooks' start-up)"
+        parts.append(("time", seconds_text(run["total_seconds"]) + (work if run["work_seconds"] is not None else "")))
     if run["peak_memory_mb"]:
         parts.append(("peak memory", f"{run['peak_memory_mb'] / 1000:.2f} GB"))
     # The page lists Python's version with the other versions.
-    machine = ", ".join(
-        f"{value} {key}" if key == "cores" else str(value) for key, value in run["machine"].items() if key != "python"
-    )
-    return [*parts, ("machine", machine)] if machine else parts
+    machine = {key: value for key, value in run["machine"].items() if key != "python"}
+    texts = [f"{value} cores" if key == "cores" else str(value) for key, value in machine.items()]
+    return [*parts, ("machine", ", ".join(texts))]
 
 
 def _stage_name(row: dict[str, Any]) -> str:
@@ -214,13 +200,11 @@ def _stages(run: dict[str, Any], run_dir: Path) -> Markup:
 
 def _not_done(run: dict[str, Any]) -> Markup:
     """List the items that stages left out, and why."""
-    rows = [
-        (str(row.get("scene") or ""), str(item.get("what", "")), str(item.get("reason", "")), str(row.get("stage", "")))
-        for row in run["stages"]
-        for item in row.get("left_out") or ()
-    ]
-    table = pd.DataFrame(rows, columns=["scene", "what", "reason", "stages"]).drop_duplicates()
-    stages = table.groupby(["scene", "what", "reason"], sort=False)["stages"].agg(", ".join)
+    items = [(row, item) for row in run["stages"] for item in row.get("left_out") or ()]
+    columns = ["scene", "what", "reason", "stages"]
+    rows = [(row.get("scene"), item.get("what"), item.get("reason"), row.get("stage")) for row, item in items]
+    table = pd.DataFrame(rows, columns=columns).fillna("").astype(str).drop_duplicates()
+    stages = table.groupby(columns[:3], sort=False)["stages"].agg(", ".join)
     return _table(stages.reset_index(), "Left out, and why")
 
 
@@ -230,31 +214,29 @@ def _not_done(run: dict[str, Any]) -> Markup:
 def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any]:
     """Return the template variables of one scene."""
     messages: list[str] = []
-    tables = ("recall", "errors", "losses", "retrieval", "sequence", "changes")
-    older, older_pictures = older_files(files.evaluation, "evaluate"), older_files(files.visualization, "visualize")
+    older, older_images = older_files(files.evaluation, "evaluate"), older_files(files.visualization, "visualize")
     recall, errors, losses, retrieval, sequences, changes = (
         pd.DataFrame() if f"{name}.csv" in older else _read_table(files.evaluation / f"{name}.csv", messages)
-        for name in tables
+        for name in ("recall", "errors", "losses", "retrieval", "sequence", "changes")
     )
     thresholds = [column for column in recall.columns if column.startswith("recall@")]
     queries = _read_statuses(files, messages)
     messages += [f"Not shown: {why}" for why in dict.fromkeys(older.values())]
-    if older_pictures:
-        first = next(iter(older_pictures.values()))
-        messages.append(f"Not shown: {len(older_pictures)} pictures and recordings. {first}")
-    older |= older_pictures
+    for why in list(older_images.values())[:1]:
+        messages.append(f"Not shown: {len(older_images)} pictures and recordings. {why}")
+    older |= older_images
     made = {"localize": files.poses_dir, "rerank": files.reranked_dir, "retrieve": files.retrieval_dir}
     for stage, folder in made.items():
         messages += list(older_files(folder, stage).values())[:1]
     if len(recall):
         messages += read_json(sidecar_path(files.evaluation / "recall.csv")).get("settings", {}).get("messages", [])
-    unit = unit_of(*thresholds)
-    small, factor = small_unit(unit)
+    unit = metrics.unit_of(*thresholds)
+    small, factor = metrics.small_unit(unit)
     remarks, lengths = list[str](), list[str]()
     for path in sorted(files.poses_dir.glob(f"{glob.escape(files.scene)}_map_*.json")):
         record = read_map_record(path)
         remarks += [f"{path.stem}: {record['text']}"] if record["text"] else []
-        lengths += [f"{length_unit(record)[1]:.3g} in {path.stem}"] if record["depth"] else []
+        lengths += [f"{metrics.length_unit(record)[1]:.3g} in {path.stem}"] if record["depth"] else []
     if unit != "m":
         depth = f"a tenth of the median scene depth of a map{': ' if lengths else ''}{', '.join(lengths)}"
         remarks.append(f"The unit of the poses is not known: {unit} is {depth}.")
@@ -274,7 +256,7 @@ def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any
         "headlines": headlines,
         "messages": messages,
         "remarks": remarks,
-        "recall": [_matrix(recall, column, f"Recall at {threshold_text(column)} [%]") for column in thresholds],
+        "recall": [_matrix(recall, column, f"Recall at {metrics.threshold_text(column)} [%]") for column in thresholds],
         "medians": thresholds and [
             _matrix(recall, "median_rotation_deg", "Median rotation error [°]", number),
             _matrix(
@@ -305,7 +287,7 @@ def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any
 def _read_table(path: Path, messages: list[str]) -> pd.DataFrame:
     """Read a table; empty if the file is missing. An unreadable file adds a line to `messages`."""
     try:
-        return named_as_meters(pd.read_csv(path, dtype={"device_id": str}).rename(columns=POSES_UNIT))
+        return metrics.named_as_meters(pd.read_csv(path, dtype={"device_id": str}).rename(columns=POSES_UNIT))
     except (FileNotFoundError, pd.errors.EmptyDataError):
         pass
     except (OSError, ValueError) as error:
@@ -315,16 +297,16 @@ def _read_table(path: Path, messages: list[str]) -> pd.DataFrame:
 
 def _read_statuses(files: SceneFiles, messages: list[str]) -> pd.DataFrame:
     """Return `STATUS_COLUMNS` of every query of every pair, with or without ground truth."""
-    tables = []
+    tables = [pd.DataFrame()]
     for path in pairs_of(files.poses_dir):
         try:
             results = PairResults.open(path)
         except ArtifactError:
             messages.append(f"{path.name} cannot be read")
             continue
-        table, devices = results.table.reindex(columns=STATUS_COLUMNS), results.devices
-        tables.append(table.assign(map_device=devices[0], query_device=devices[1]))
-    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+        devices = dict(zip(("map_device", "query_device"), results.devices, strict=True))
+        tables.append(results.table.reindex(columns=STATUS_COLUMNS).assign(**devices))
+    return pd.concat(tables, ignore_index=True)
 
 
 def _verdict(
@@ -342,22 +324,21 @@ def _verdict(
     if not len(done):
         return verdict, headlines
     for column in thresholds:
-        headlines.append((f"{percent(done[column].mean())} %", f"mean recall at {threshold_text(column)}"))
+        headlines.append((f"{percent(done[column].mean())} %", f"mean recall at {metrics.threshold_text(column)}"))
     if len(errors):
         rotation_deg, translation_m = errors[["rotation_error_deg", "translation_error_m"]].median()
-        length = _length(translation_m, unit_of(thresholds[0]))
+        length = _length(translation_m, metrics.unit_of(thresholds[0]))
         headlines.append((length, f"median position error; rotation {number(rotation_deg)}°"))
-    strict = thresholds[0]
+    strict, limit = thresholds[0], metrics.threshold_text(thresholds[0])
     weakest = done.loc[done[strict].idxmin()]
-    share, limit = percent(weakest[strict]), threshold_text(strict)
     if weakest[strict] == done[strict].max():
-        verdict.append(f"Every pair has {share} % at {limit}.")
+        verdict.append(f"Every pair has {percent(weakest[strict])} % at {limit}.")
     else:
         pair = f"{weakest['query_device']} queries in the {weakest['map_device']} map"
-        verdict.append(f"Weakest pair at {limit}: {pair}, {share} %.")
+        verdict.append(f"Weakest pair at {limit}: {pair}, {percent(weakest[strict])} %.")
     if "ok_wrong" in done:
         wrong = float((done["ok_wrong"] * done["queries"]).sum() / done["queries"].sum())
-        what = f"called ok, but beyond {WRONG[0]:g}°, {WRONG[1]:g} {unit_of(strict)}"
+        what = f"called ok, but beyond {metrics.WRONG[0]:g}°, {metrics.WRONG[1]:g} {metrics.unit_of(strict)}"
         headlines.append((f"{percent(wrong)} %", what))
     return verdict, headlines
 
@@ -367,14 +348,13 @@ def _escalation(queries: pd.DataFrame) -> list[str]:
     escalated = queries[queries["first_status"].notna()]
     if not len(escalated):
         return []
-    ok = (escalated["status"] == "ok").sum()
-    before, after = (statuses(escalated[name]) == Status.FAILED for name in ("first_status", "status"))
-    posed = (before & ~after).sum()
+    before, after = (statuses(escalated[name]) for name in ("first_status", "status"))
+    posed = ((before == Status.FAILED) & (after != Status.FAILED)).sum()
     seconds = (escalated["seconds"] - escalated["first_seconds"]).sum()
     gained = f", {posed} without a pose got one" if posed else ""
     return [
-        f"{len(escalated)} were not sure and escalated to further features: {ok} are ok now{gained}. "
-        f"That took {number(seconds)} s, {number(seconds / len(escalated))} s per query."
+        f"{len(escalated)} were not sure and escalated to further features: {(after == Status.OK).sum()} are ok "
+        f"now{gained}. That took {number(seconds)} s, {number(seconds / len(escalated))} s per query."
     ]
 
 
@@ -429,8 +409,8 @@ def _matrix(table: pd.DataFrame, column: str, title: str, write: Write = percent
 
 def _scores(table: pd.DataFrame, caption: str, thresholds: list[str]) -> Markup:
     """Return a table with columns of recall and median errors."""
-    small, factor = small_unit(unit_of(*thresholds))
-    shares = {name: f"recall {threshold_text(name)}" for name in thresholds} | {"ok_wrong": "ok but wrong"}
+    small, factor = metrics.small_unit(metrics.unit_of(*thresholds))
+    shares = {name: f"recall {metrics.threshold_text(name)}" for name in thresholds} | {"ok_wrong": "ok but wrong"}
     names = {"map_device": "map", "query_device": "query", "low_confidence": "low confidence", "state": "note"}
     names |= {"median_rotation_deg": "median [°]", "median_translation_m": f"median [{small}]", **shares}
     formats: dict[str, Write] = {"median [°]": number, f"median [{small}]": lambda length: number(factor * length)}
@@ -459,11 +439,14 @@ def _changes(changes: pd.DataFrame, unit: str) -> Markup:
     if not len(changes):
         return Markup()
     shown = changes.sort_values("change", kind="stable")[:WORST]
-    off = {of: [off_by(row, of, unit=unit) for row in shown.to_dict("records")] for of in ("single_", "")}
-    columns = {"query": _queries(shown), "change": shown["change"], "single": off["single_"], "sequence": off[""]}
-    table = pd.DataFrame({**columns, "device": shown["device_id"], "timestamp [µs]": shown["timestamp"]})
-    counts = changes["change"].value_counts()
-    caption = ", ".join(f"{counts.get(name, 0)} {name}" for name in CHANGES)
+    rows = shown.to_dict("records")
+    table = pd.DataFrame({
+        "query": _queries(shown), "change": shown["change"],
+        "single": [off_by(row, "single_", unit=unit) for row in rows],
+        "sequence": [off_by(row, unit=unit) for row in rows],
+        "device": shown["device_id"], "timestamp [µs]": shown["timestamp"],
+    })  # fmt: skip
+    caption = ", ".join(f"{(changes['change'] == name).sum()} {name}" for name in CHANGES)
     return _table(table, f"Queries within the last threshold only with or only without their sequence: {caption}")
 
 
@@ -472,15 +455,15 @@ def _losses(losses: pd.DataFrame) -> Markup:
     if "threshold" not in losses or losses["threshold"].isna().all():
         return Markup()
     sums = {
-        threshold_text(str(threshold)): pd.concat([pairs, pairs.assign(map_device="all")])
-        .groupby("map_device", sort=False)[["queries", "missed", *REASONS]]
+        metrics.threshold_text(threshold): pd.concat([pairs, pairs.assign(map_device="all")])
+        .groupby("map_device", sort=False)[["queries", "missed", *metrics.REASONS]]
         .sum()
         for threshold, pairs in losses.groupby("threshold", sort=False)
     }
     table = pd.concat(sums, names=["threshold", "map"]).reset_index()
-    table[[*REASONS]] = table[[*REASONS]].div(table["queries"], axis="index")
+    table[[*metrics.REASONS]] = table[[*metrics.REASONS]].div(table["queries"], axis="index")
     caption = "Queries missed at each threshold, and the share of all queries lost for each reason"
-    return _table(table, caption, dict.fromkeys(REASONS, _share))
+    return _table(table, caption, dict.fromkeys(metrics.REASONS, _share))
 
 
 def _failures(queries: pd.DataFrame) -> Markup:
@@ -493,11 +476,10 @@ def _failures(queries: pd.DataFrame) -> Markup:
     groups = _queries(failed).groupby(reasons.rename("reason"))
     where = groups.agg(lambda pairs: ", ".join(f"{pair} {count}" for pair, count in pairs.value_counts().items()))
     table = pd.DataFrame({"queries": groups.size(), "where": where})
-    table = table.sort_values("queries", ascending=False, kind="stable")
-    caption = "Queries without a pose, by reason"
-    if rest := table["queries"][MOST_REASONS:].sum():
-        caption += f"; {rest} more have other reasons"
-    return _table(table[:MOST_REASONS].reset_index(), caption)
+    table = table.sort_values("queries", ascending=False, kind="stable").reset_index()
+    rest = table["queries"][MAX_REASONS:].sum()
+    caption = "Queries without a pose, by reason" + (f"; {rest} more have other reasons" if rest else "")
+    return _table(table[:MAX_REASONS], caption)
 
 
 def _wrong_ok(errors: pd.DataFrame, unit: str) -> Markup:
@@ -506,8 +488,9 @@ def _wrong_ok(errors: pd.DataFrame, unit: str) -> Markup:
         return Markup()
     called_ok = errors[errors["status"] == "ok"]
     turned, moved = called_ok[["rotation_error_deg", "translation_error_m"]].to_numpy(float).T
-    wrong = called_ok[~is_below(turned, moved, WRONG)].sort_values("translation_error_m", ascending=False)
-    limit = f"{WRONG[0]:g}°, {WRONG[1]:g} {unit}"
+    wrong = called_ok[~metrics.is_below(turned, moved, metrics.WRONG)]
+    wrong = wrong.sort_values("translation_error_m", ascending=False)
+    limit = f"{metrics.WRONG[0]:g}°, {metrics.WRONG[1]:g} {unit}"
     caption = f"{len(wrong)} of {len(called_ok)} poses that are called ok are wrong: beyond {limit}."
     if len(wrong) > WORST:
         caption += f" These are the {WORST} worst; evaluation/errors.csv has all."
@@ -518,9 +501,9 @@ def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Markup:
     """List the queries with the largest errors or, without ground truth, with the least support."""
     if not len(queries):
         return Markup()
-    threshold = parse_threshold(thresholds[0]) if thresholds else THRESHOLDS[0]
-    unit = unit_of(*thresholds)
-    worst = queries.iloc[worst_first(queries, threshold)[:WORST]]
+    threshold = metrics.parse_threshold(thresholds[0]) if thresholds else metrics.THRESHOLDS[0]
+    unit = metrics.unit_of(*thresholds)
+    worst = queries.iloc[metrics.worst_first(queries, threshold)[:WORST]]
     caption = f"The {len(worst)} least supported; there is no ground truth to compare with"
     if "rotation_error_deg" in queries:
         caption = f"The {len(worst)} worst, by the larger of rotation error / {threshold[0]:g}° and "
@@ -536,11 +519,8 @@ def _listed(queries: pd.DataFrame, caption: str, unit: str) -> Markup:
         table["off by"] = [off_by(row, unit=unit) for row in rows]
         table["why"] = [_why(row) for row in rows]
     table["status"], table["inliers"] = queries["status"].str.replace("_", " "), queries["num_inliers"]
+    table["image"] = queries["image"].fillna("").map(_shown_names)
     names |= {"p_correct": "stated to be right", "rival_support": "support of a rival"}
-    if "image" in queries and queries["image"].notna().all():
-        table["image"] = queries["image"].map(_shown_names)
-    else:  # tables of earlier versions have no names
-        names |= {"device_id": "device", "timestamp": "timestamp [µs]"}
     known = queries.filter([*names]).dropna(axis="columns", how="all").rename(columns=names)
     formats = {"stated to be right": "{:.1%}".format, "support of a rival": "{:.0%}".format}
     return _table(table.join(known), caption, formats)
@@ -558,9 +538,11 @@ def _shown_names(images: str) -> str:
 
 def _why(row: dict[str, Any]) -> str:
     """Return the reason of the loss at the widest threshold that a query misses."""
-    losses = {name: reason for name, reason in row.items() if name.startswith("loss@")}
-    missed = [f"{reason} at {threshold_text(name)}" for name, reason in losses.items() if reason in REASONS]
-    return missed[-1] if missed else "within every threshold" if losses else ""
+    losses = {name: row[name] for name in row if name.startswith("loss@")}
+    missed = [name for name in losses if losses[name] in metrics.REASONS]
+    if missed:
+        return f"{losses[missed[-1]]} at {metrics.threshold_text(missed[-1])}"
+    return "within every threshold" if losses else ""
 
 
 def _retrieval(retrieval: pd.DataFrame, headlines: list[tuple[str, str]], unit: str) -> tuple[list[Markup], str]:
@@ -568,9 +550,8 @@ def _retrieval(retrieval: pd.DataFrame, headlines: list[tuple[str, str]], unit: 
     done = retrieval.dropna(subset=ks) if ks else retrieval.iloc[:0]
     if not len(done):
         return [], ""
-    titles = {k: f"In the first {k.removeprefix('recall@')} [%]" for k in ks}
-    titles["in_map"] = "Anywhere in the map [%]"
-    matrices = [_matrix(retrieval, column, titles[column]) for column in titles if column in done]
+    titles = {k: f"In the first {k.removeprefix('recall@')} [%]" for k in ks} | {"in_map": "Anywhere in the map [%]"}
+    matrices = [_matrix(retrieval, column, title) for column, title in titles.items() if column in done]
     first = ks[-1].removeprefix("recall@")
     headlines.append((f"{percent(done[ks[-1]].mean())} %", f"have a good reference in the first {first}"))
     reach = f"{done['radius_m'].iloc[0]:g} {unit}"
@@ -629,18 +610,11 @@ def seconds_text(seconds: float | None) -> str:
     return f"{int(seconds) // 60} min {int(seconds) % 60} s"
 
 
-def threshold_text(name: str) -> str:
-    degrees, meters = parse_threshold(name)
-    return f"{degrees:g}°, {meters:g}\N{NO-BREAK SPACE}{unit_of(name)}"
-
-
 class Album:
-    """Turns picture files into data URLs until `room` bytes are used up."""
+    """Turns PNG files into data URLs until `room` bytes are used up."""
 
     def __init__(self, run_dir: Path, room: int, left_out: list[str]) -> None:
-        self.run_dir = run_dir
-        self.left_out = left_out
-        self._room = room
+        self.run_dir, self.room, self.left_out = run_dir, room, left_out
 
     def picture(self, path: Path, title: str = "", caption: str = "") -> Picture:
         """Return a picture for the page; without a `title`, it has the one in the file."""
@@ -659,8 +633,8 @@ class Album:
                         data, kind = small, "jpeg"
         except (OSError, ValueError, SyntaxError) as error:  # Pillow raises the latter two for some torn PNGs
             return Picture("", f"{name} cannot be read: {error}", "", link)
-        if len(data) > self._room:
+        if len(data) > self.room:
             self.left_out.append(name)
             return Picture("", title, caption, link)
-        self._room -= len(data)
+        self.room -= len(data)
         return Picture(f"data:image/{kind};base64,{base64.b64encode(data).decode()}", title, caption, link, wide)

@@ -1,6 +1,7 @@
-"""Pose errors, recall, reasons of losses, and the order of queries from worst to best."""
+"""Pose errors, recall, reasons of losses, the order of queries from worst to best, and overlap of images in view."""
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -8,11 +9,16 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from toolkit.geometry import Floats, Ints, pose_error
+from toolkit.capture.cameras import in_view, view_bounds
+from toolkit.files import image_name
+from toolkit.geometry import Floats, Ints, invert, pose_error, transform
 from toolkit.pose.result import Status, statuses
 
 if TYPE_CHECKING:
+    import pycolmap
+
     from toolkit.capture import Session, Trajectory
+    from toolkit.mapping.local_map import LocalMap
 
 Threshold = tuple[float, float]
 """Degrees and meters."""
@@ -22,7 +28,8 @@ WRONG: Threshold = (5, 0.5)
 """An `ok` pose with larger errors counts as wrong (`ok_wrong`)."""
 NO_REFERENCE, NO_POSE, WRONG_POSE = REASONS = ("no good reference", "no pose", "wrong pose")
 """Why a query misses a threshold."""
-
+MIN_OVERLAP = 0.1
+"""A reference overlaps with a query if the query sees at least this share of the points that the reference sees."""
 UNKNOWN_UNIT = "L"
 """Replaces the meter if the unit of the poses is unknown: a tenth of the median scene depth of a map."""
 
@@ -122,6 +129,12 @@ def parse_threshold(name: str) -> Threshold:
     return float(degrees.removesuffix("deg")), float(meters.rstrip(f"m{UNKNOWN_UNIT}"))
 
 
+def threshold_text(name: str) -> str:
+    """Return the name of a threshold, or of a column `recall@...`, as a person writes it."""
+    degrees, length = parse_threshold(name)
+    return f"{degrees:g}°, {length:g}\N{NO-BREAK SPACE}{unit_of(name)}"
+
+
 def worst_first(queries: pd.DataFrame, threshold: Threshold = THRESHOLDS[0]) -> Ints:
     """Return the row positions of queries, ordered from worst to best.
 
@@ -148,6 +161,18 @@ def worst_first(queries: pd.DataFrame, threshold: Threshold = THRESHOLDS[0]) -> 
     return np.lexsort((-column("position_std_m", np.inf), column("num_inliers", 0), sure, -error, ok))
 
 
+def summary_of(
+    rotation_deg: Floats, translation_m: Floats, thresholds: Sequence[Threshold], unit: str
+) -> dict[str, float]:
+    """Return recall at each threshold, `recall@<name>`, and the medians of both errors, all queries counted."""
+    shares = recall(rotation_deg, translation_m, thresholds)
+    return {
+        **{f"recall@{threshold_name(t, unit)}": share for t, share in zip(thresholds, shares, strict=True)},
+        "median_rotation_deg": float(np.median(rotation_deg)),
+        "median_translation_m": float(np.median(translation_m)),
+    }
+
+
 def camera_messages(session: "Session", tables: Sequence[pd.DataFrame]) -> list[str]:
     """Return a message for each camera whose focal length or principal point does not fit most of its queries.
 
@@ -158,22 +183,19 @@ def camera_messages(session: "Session", tables: Sequence[pd.DataFrame]) -> list[
         tables: `poses/<pair>.csv` of pairs with these queries: timestamp, device_id, status, focal_px and
             principal_point_px.
     """
-    posed: dict[str, int] = {}
+    posed, sensors, columns = Counter[str](), session.images["sensor_id"].to_numpy(), ("focal_px", "principal_point_px")
     fitted: dict[tuple[str, str], list[tuple[list[float], str]]] = {}
-    sensors = session.images["sensor_id"].to_numpy()
     for table in tables:
-        texts = {name: _texts(table, name) for name in ("focal_px", "principal_point_px")}
-        texts_of_status = table["status"].fillna(Status.FAILED)
-        for number, (images, text) in enumerate(zip(session.rows_of_keyframes(table), texts_of_status, strict=True)):
-            status, reason = Status.parse(text)
+        rows = table.reindex(columns=["status", *columns]).astype(object)
+        texts = rows.where(rows.notna(), "").astype(str).to_dict("records")
+        for images, row in zip(session.rows_of_keyframes(table), texts, strict=True):
+            status, reason = Status.parse(row["status"] or Status.FAILED)
             if status is Status.FAILED:
                 continue
             names = [re.sub(r"[_-]\d{6,}$", "", sensor_id) for sensor_id in sensors[images]]
-            for name in names:
-                posed[name] = posed.get(name, 0) + 1
-            for column, of_queries in texts.items() if status is Status.LOW_CONFIDENCE and reason else ():
-                values = of_queries[number].split(";")
-                for name, sensor_id, value in zip(names, sensors[images], values, strict=False):
+            posed.update(names)
+            for column in columns if status is Status.LOW_CONFIDENCE and reason else ():
+                for name, sensor_id, value in zip(names, sensors[images], row[column].split(";"), strict=False):
                     if value:
                         fitted.setdefault((name, column), []).append(([float(x) for x in value.split()], sensor_id))
     messages = []
@@ -197,7 +219,48 @@ def camera_messages(session: "Session", tables: Sequence[pd.DataFrame]) -> list[
     return messages
 
 
-def _texts(table: pd.DataFrame, name: str) -> list[str]:
-    """Return a column as texts, empty where it is missing."""
-    values = (table[name] if name in table else pd.Series("", table.index)).astype(object)
-    return values.where(values.notna(), "").astype(str).tolist()
+def overlap_in_view(points: Floats, reference: Floats, world_from_cam: Floats, camera: "pycolmap.Camera") -> float:
+    """Return the share, 0 to 1, of a reference's points that lie in the view of another camera.
+
+    D2-Net (M. Dusmanu et al., CVPR 2019) selects training pairs by such an overlap of sparse points. A point counts as
+    not seen if the two lines of sight differ by more than 90 degrees, as it would be seen from behind.
+
+    Args:
+        points: (P, 3) triangulated points that the reference observes, world, meters.
+        reference: (3,) center of the reference.
+        world_from_cam: (4, 4) pose of the other camera.
+        camera: intrinsics of the other camera.
+    """
+    if not len(points):
+        return 0.0
+    in_cam = transform(invert(world_from_cam), points)
+    same_side = np.sum((points - reference) * (points - world_from_cam[:3, 3]), axis=1) > 0
+    seen = in_view(in_cam[None], view_bounds(camera)[None])[0] & same_side
+    return float(seen.mean())
+
+
+def overlap_of(
+    reference: Mapping[str, Any],
+    session: "Session",
+    local_map: "LocalMap | None",
+    world_from_cam: Floats,
+    camera: "pycolmap.Camera",
+) -> float:
+    """Return `overlap_in_view` for the points that a reference sees; without a map, for a grid of points in its view.
+
+    Args:
+        reference: `path`, `sensor_id` and `Tws`, as in a file of references.
+        session: its session.
+        local_map: the triangulated map of the session.
+        world_from_cam, camera: pose (4, 4) and intrinsics of the other image.
+    """
+    pose = np.array(reference["Tws"], float)
+    if local_map is not None:
+        image = local_map.index_of.get(image_name(str(reference["path"])))
+        seen = np.zeros(0, np.int64) if image is None else np.unique(local_map.observations(image)[1])
+        return overlap_in_view(local_map.points[seen], pose[:3, 3], world_from_cam, camera)
+    left, right, top, bottom = view_bounds(session.camera(reference["sensor_id"]))
+    x, y = np.meshgrid(np.linspace(left, right, 9), np.linspace(top, bottom, 9))
+    rays = np.stack([x, y, np.ones_like(x)], -1).reshape(1, -1, 3)
+    points = (rays * np.array([2.0, 4.0, 8.0, 16.0])[:, None, None]).reshape(-1, 3)
+    return overlap_in_view(transform(pose, points), pose[:3, 3], world_from_cam, camera)

@@ -6,6 +6,7 @@ file, so that they do not use results which an earlier run made of the pair from
 
 import json
 import logging
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -16,6 +17,7 @@ import pandas as pd
 
 from toolkit.errors import OF_THE_DATA, ArtifactError, DamagedError
 from toolkit.files import pair_name, read_json, write_text
+from toolkit.manifest import Settings
 
 log = logging.getLogger(__name__)
 
@@ -37,10 +39,11 @@ class PairRows:
 
     @contextmanager
     def row(self, map_device: str, query_device: str) -> Iterator[dict[str, Any]]:
-        """Yield the row of a pair, new or existing, for the caller to fill.
+        """Yield the row of a pair, new or existing, for the caller to fill; the time until then is in `seconds`.
 
         If the body raises an error that the pair's data cause, the row gets it as its `reason`, and the run continues.
         """
+        started = time.perf_counter()
         name = pair_name(self.scene, map_device, query_device)
         note = _note(self.out_dir, name)
         pair: dict[str, Any] = {"map_device": map_device, "query_device": query_device}
@@ -50,7 +53,9 @@ class PairRows:
             self.rows.append(row)
         try:
             yield row
-            row["reason"] = ""
+            row["seconds"] = round(row.get("seconds", 0.0) + time.perf_counter() - started, 3)
+            # The last columns of every table, in this order.
+            row |= {name: row.pop(name) for name in ("seconds", "skipped", "path") if name in row} | {"reason": ""}
             note.unlink(missing_ok=True)
         except DamagedError:
             raise  # damaged files are rebuilt, see `store.items.heals`
@@ -67,8 +72,10 @@ class PairRows:
         if self.upstream is not None and (reason := left_out(self.upstream, name)):
             raise ArtifactError(reason)
 
-    def frame(self) -> pd.DataFrame:
-        """Return the table. `reason` is empty for finished pairs; the other columns of a left-out pair are zero.
+    def frame(self, settings: Settings | None = None) -> pd.DataFrame:
+        """Return the table, and write the settings, if given, beside the stage's results.
+
+        `reason` is empty for finished pairs; the other columns of a left-out pair are zero.
 
         Raises:
             ToolkitError: no pair could be done; the error of the first one.
@@ -76,6 +83,8 @@ class PairRows:
         done = next((row for row in self.rows if not row["reason"]), None)
         if done is None and self.errors:
             raise self.errors[0]
+        if settings is not None:
+            write_text(self.out_dir / "settings.json", settings.model_dump_json(indent=1) + "\n")
         empty = {name: type(value)() for name, value in (done or {}).items()}
         return pd.DataFrame([empty | row for row in self.rows])
 

@@ -39,13 +39,10 @@ def changed_keys(plain: Manifest, changed: Manifest, overrides: Iterable[str]) -
     return keys
 
 
-_ABSENT = object()
-
-
 def _value(content: Any, key: str) -> Any:
-    """Return the value of a key `stage.key` in nested dicts, `_ABSENT` without one."""
+    """Return the value of a key `stage.key` in nested dicts, None without one."""
     for part in key.strip().split("."):
-        content = content.get(part, _ABSENT) if isinstance(content, dict) else _ABSENT
+        content = content.get(part) if isinstance(content, dict) else None
     return content
 
 

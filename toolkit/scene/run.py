@@ -1,5 +1,6 @@
 """A run in the hand: what a manifest made."""
 
+import difflib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -8,7 +9,8 @@ from typing import Any
 import pandas as pd
 
 from toolkit.errors import ArtifactError
-from toolkit.files import SceneFiles, read_json
+from toolkit.files import SceneFiles, pair_devices, read_json
+from toolkit.pose.base import Query
 from toolkit.results.pair import PairResults, pairs_of
 from toolkit.runs.folder import RECORD
 from toolkit.scene.map import Map
@@ -75,3 +77,31 @@ class Run:
         if not tables:
             return pd.DataFrame(columns=[*keys, "status"])
         return pd.concat(tables, names=keys).reset_index(keys).reset_index(drop=True)
+
+    def __getitem__(self, name: str) -> Query:
+        """Return a query of the run: the images of one device at one instant, of which one has this name.
+
+        Args:
+            name: `<session>/raw_data/<path>`, or an end of it that no other query image has, such as `0008.jpg`.
+
+        Raises:
+            ArtifactError: no query image has this name, or several do; names the nearest.
+        """
+        images: dict[str, tuple[Map, str]] = {}
+        for scene in self.scenes:
+            pairs = [pair_devices(path.stem) for path in pairs_of(SceneFiles(self.path, scene).poses_dir)]
+            scene_map = self.map(pairs[0][0], scene)
+            for device in dict.fromkeys(query_device for _, query_device in pairs):
+                session = scene_map.capture[f"{device}_query"]
+                images |= dict.fromkeys(session.image_names, (scene_map, session.id))
+        found = [image for image in images if image == name or image.endswith(f"/{name}")]
+        if len(found) != 1:
+            close = found or difflib.get_close_matches(name, images, n=3, cutoff=0.0)
+            raise ArtifactError(
+                f"{self.path}: found {len(found)} query images with the name {name!r}, expected one. Near: {close[:3]}."
+            )
+        scene_map, session_id = images[found[0]]
+        session = scene_map.capture[session_id]
+        keyframes = session.rows_of_keyframes(session.keyframes("all"))
+        row = session.row_of_name[found[0]]
+        return scene_map.query_of_session(session, next(rows for rows in keyframes if row in rows))

@@ -3,13 +3,15 @@
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import shrunk
@@ -20,7 +22,6 @@ from toolkit.geometry import Floats, rotation_to_quaternion, unit
 
 if TYPE_CHECKING:
     import pycolmap
-    import rerun as rr
 
 Image = NDArray[np.uint8]
 
@@ -33,10 +34,8 @@ HIDDEN_M = 1e-3
 
 
 @contextmanager
-def open_recording(out: str | Path, name: str, blueprint: Any) -> "Iterator[rr.RecordingStream]":
+def open_recording(out: str | Path, name: str, blueprint: Any) -> Iterator[rr.RecordingStream]:
     """Yield a stream that writes to the file `out`; after an error in the block, `out` is not written."""
-    import rerun as rr
-
     with write_atomic(out) as temporary:
         # A fixed id, so that a recording replaces an older one of the same name in the viewer.
         stream = rr.RecordingStream(APPLICATION, recording_id=name)
@@ -70,8 +69,6 @@ def spawn_viewer(path: str | Path) -> None:
 
 def entity(*parts: str) -> str:
     """Return the path of an entity; parts may contain any character."""
-    import rerun as rr
-
     return "/".join(rr.escape_entity_path_part(part) for part in parts)
 
 
@@ -92,10 +89,8 @@ def shown_intrinsics(camera: "pycolmap.Camera", shown: tuple[int, int]) -> Float
     return np.diag([shown[0] / camera.width, shown[1] / camera.height, 1.0]) @ camera.calibration_matrix()
 
 
-def pinhole_of(camera: "pycolmap.Camera", shown: tuple[int, int], depth_m: float, color: str) -> "rr.Pinhole":
+def pinhole_of(camera: "pycolmap.Camera", shown: tuple[int, int], depth_m: float, color: str) -> rr.Pinhole:
     """Return a pinhole camera for an image at the size shown (w, h), with the image plane at `depth_m`."""
-    import rerun as rr
-
     return rr.Pinhole(
         image_from_camera=shown_intrinsics(camera, shown),
         resolution=shown,
@@ -105,10 +100,8 @@ def pinhole_of(camera: "pycolmap.Camera", shown: tuple[int, int], depth_m: float
     )
 
 
-def transform_of(parent_from_child: ArrayLike) -> "rr.Transform3D":
+def transform_of(parent_from_child: ArrayLike) -> rr.Transform3D:
     """Return the pose (4, 4) of an entity in its parent."""
-    import rerun as rr
-
     pose = np.asarray(parent_from_child, np.float64)
     w, x, y, z = rotation_to_quaternion(pose[:3, :3])
     return rr.Transform3D(translation=pose[:3, 3], quaternion=rr.Quaternion(xyzw=[x, y, z, w]))
@@ -116,8 +109,6 @@ def transform_of(parent_from_child: ArrayLike) -> "rr.Transform3D":
 
 def world_axes(up: Floats) -> Any:
     """Return the viewer's coordinate system whose up axis is the world axis nearest to `up`."""
-    import rerun as rr
-
     axis = int(np.argmax(np.abs(up)))
     return getattr(rr.ViewCoordinates, f"RIGHT_HAND_{'XYZ'[axis]}_{'UP' if up[axis] > 0 else 'DOWN'}")
 
@@ -128,8 +119,6 @@ def scene_view(poses: Floats, up: Floats, name: str) -> Any:
     Args:
         up: up direction (3,) of any length.
     """
-    import rerun.blueprint as rrb
-
     eye, up = None, unit(up)
     if len(poses):
         place = places_of(poses[:, :3, 3])
@@ -152,12 +141,20 @@ def camera_depth_m(centers: Floats) -> float:
     return float(np.clip(np.median(cKDTree(spots).query(spots, k=2)[0][:, 1]) / 2, 0.05, 1.0))
 
 
-def log_points(stream: "rr.RecordingStream", points: ArrayLike, colors: NDArray[np.uint8] | None) -> None:
+def log_points(stream: rr.RecordingStream, points: ArrayLike, colors: NDArray[np.uint8] | None) -> None:
     """Log the map's points (P, 3), colors (P, 3) RGB or None, as `world/points`."""
-    import rerun as rr
-
     cloud = rr.Points3D(points, colors=rgb(POINT_COLOR) if colors is None else colors, radii=rr.Radius.ui_points(1.5))
     stream.log("world/points", cloud, static=True)
+
+
+def log_lines(stream: rr.RecordingStream, path: str, lines: Sequence[Floats], color: str) -> None:
+    """Log lines, (n, 3) each."""
+    stream.log(path, rr.LineStrips3D(lines, colors=rgb(color)), static=True)
+
+
+def hidden_camera() -> rr.Pinhole:
+    """Return any camera that is too small to see."""
+    return rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=HIDDEN_M)
 
 
 def rgb(color: str) -> list[int]:

@@ -9,7 +9,7 @@ from typing import Any
 from urllib.parse import quote
 
 from toolkit.errors import ArtifactError
-from toolkit.figures.png import as_jpeg
+from toolkit.figures.style import as_jpeg
 from toolkit.runs.kernel import TEXT_BARS
 from toolkit.viewer.blueprint import open_command
 

@@ -4,25 +4,24 @@ import logging
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
+from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import prefetch, read_for_display
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.figures.style import ESTIMATED, GREEN, MAP, ORANGE, SKY, TRUE, draw_error_legend, error_colors
 from toolkit.geometry import Floats, local_origin, project, shifted
-from toolkit.results.images import REFERENCES, Localizations, QueryDetails, ShownImage, support_of
+from toolkit.results.localized import REFERENCES, Localizations, QueryDetails, ShownImage, support_of
 from toolkit.results.metrics import is_posed
 from toolkit.viewer import blueprint as viewer
 
-if TYPE_CHECKING:
-    import rerun as rr
-
 logger = logging.getLogger(__name__)
-
 
 QUERY = "query"
 """Timeline of the query numbers, which are the rows of the pair's csv."""
@@ -61,26 +60,22 @@ def record_localizations(
         tracks: positions (n, 3) of each piece of the query recordings: `odometry`, rigidly placed in the map, and
             `frames`, as estimated by the sequence stage.
     """
-    import rerun as rr
-
     started = time.perf_counter()
     poses = map_poses[is_posed(map_poses)]
     shift = -local_origin(poses[:, :3, 3])
-    poses, points, localizations = shifted(poses, shift), np.asarray(points) + shift, localizations.shifted(shift)
-    details = ((number, query.shifted(shift)) for number, query in details)
+    poses = shifted(poses, shift)
     up = np.asarray(up_of_cameras(poses) if up is None else up, np.float64)
     size = viewer.camera_depth_m(poses[:, :3, 3])
     count = 0
     with viewer.open_recording(out, name, _layout(name, poses, up)) as stream:
         stream.log("world", viewer.world_axes(up), static=True)
-        viewer.log_points(stream, points, colors)
+        viewer.log_points(stream, np.asarray(points) + shift, colors)
         _log_map_cameras(stream, poses, size)
-        _log_overview(stream, localizations)
+        _log_overview(stream, localizations, shift)
         for kind, color in (("odometry", ORANGE), ("frames", SKY)):
             if tracks and tracks.get(kind):
-                lines = rr.LineStrips3D([track + shift for track in tracks[kind]], colors=viewer.rgb(color))
-                stream.log(f"world/recording/{kind}", lines, static=True)
-        writer = _ChosenWriter(stream, localizations, 2 * size)
+                viewer.log_lines(stream, f"world/recording/{kind}", [track + shift for track in tracks[kind]], color)
+        writer = _ChosenWriter(stream, localizations, 2 * size, shift)
         for number, chosen in prefetch(writer.read, details):
             writer.write(number, chosen)
             count += 1
@@ -91,22 +86,14 @@ def record_localizations(
 
 def _layout(name: str, poses: Floats, up: Floats) -> Any:
     """Return the viewer's layout: the scene, and beside it the chosen query, its references and a text page."""
-    import rerun.blueprint as rrb
-
     scene = viewer.scene_view(poses, up, name)
+    cameras = {f"query, camera {k}": f"world/chosen/camera_{k}" for k in range(MAX_CAMERAS)}
+    ranked = {f"reference {rank}": f"world/references/{rank}" for rank in range(1, REFERENCES + 1)}
     # Show marks only in the 2D views: on the image planes of the 3D scene they would hide it.
-    hidden = [f"- /world/chosen/camera_{k}/marks/**" for k in range(MAX_CAMERAS)]
-    hidden += [f"- /world/references/{rank}/marks/**" for rank in range(1, REFERENCES + 1)]
-    scene.contents = ["+ $origin/**", *hidden]
-    query = rrb.Tabs(
-        *[rrb.Spatial2DView(origin=f"world/chosen/camera_{k}", name=f"query, camera {k}") for k in range(MAX_CAMERAS)]
-    )
+    scene.contents = ["+ $origin/**", *(f"- /{path}/marks/**" for path in (cameras | ranked).values())]
+    query = rrb.Tabs(*(rrb.Spatial2DView(origin=path, name=name) for name, path in cameras.items()))
     references = rrb.Grid(
-        *[
-            rrb.Spatial2DView(origin=f"world/references/{rank}", name=f"reference {rank}")
-            for rank in range(1, REFERENCES + 1)
-        ],
-        grid_columns=2,
+        *(rrb.Spatial2DView(origin=path, name=name) for name, path in ranked.items()), grid_columns=2
     )
     about = rrb.Horizontal(
         rrb.TextDocumentView(origin="about", name="about the query"),
@@ -118,32 +105,28 @@ def _layout(name: str, poses: Floats, up: Floats) -> Any:
     return rrb.Blueprint(rrb.Horizontal(scene, side, column_shares=[3, 2]), panel, collapse_panels=True)
 
 
-def _log_map_cameras(stream: "rr.RecordingStream", poses: Floats, size: float) -> None:
+def _log_map_cameras(stream: rr.RecordingStream, poses: Floats, size: float) -> None:
     """Log the map's cameras as small pyramids, all in one entity."""
-    import rerun as rr
-
     corners = size * np.array([[0, 0, 0], [-0.4, -0.3, 1], [0.4, -0.3, 1], [0.4, 0.3, 1], [-0.4, 0.3, 1.0]])
     outline = corners[[0, 1, 2, 0, 3, 4, 0, 1, 4, 3, 2]]
     lines = np.einsum("nij,kj->nki", poses[:, :3, :3], outline) + poses[:, None, :3, 3]
     stream.log("world/map_cameras", rr.LineStrips3D(lines.astype(np.float32), colors=viewer.rgb(MAP)), static=True)
 
 
-def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
+def _log_overview(stream: rr.RecordingStream, queries: Localizations, shift: Floats) -> None:
     """Log all queries: estimates and error lines colored by error, true positions, failures at their references."""
-    import rerun as rr
-
     located, has_truth = is_posed(queries.estimated), is_posed(queries.true)
-    colors = error_colors(queries.table["translation_error_m"])
+    colors = error_colors(queries.errors["translation_error_m"])
     labels = np.array([f"#{k} {describe(queries, k)}" for k in range(len(queries.names))], object)
 
     def dots(path: str, rows: NDArray[np.bool_], centers: Floats, color: Any, radius: float) -> None:
         style = {"colors": color, "radii": rr.Radius.ui_points(radius), "show_labels": False}
-        stream.log(path, rr.Points3D(centers[rows], labels=labels[rows].tolist(), **style), static=True)
+        stream.log(path, rr.Points3D(centers[rows] + shift, labels=labels[rows].tolist(), **style), static=True)
 
     dots("world/queries/true", has_truth, queries.true[:, :3, 3], viewer.rgb(TRUE), 3)
     dots("world/queries/estimated", located, queries.estimated[:, :3, 3], colors[located], 5)
     both = located & has_truth
-    lines = np.stack([queries.estimated[both, :3, 3], queries.true[both, :3, 3]], axis=1)
+    lines = np.stack([queries.estimated[both, :3, 3], queries.true[both, :3, 3]], axis=1) + shift
     stream.log("world/queries/error", rr.LineStrips3D(lines.astype(np.float32), colors=colors[both]), static=True)
     if len(queries.nearest_reference):
         lost = ~located & np.isfinite(queries.nearest_reference).all(1)
@@ -153,10 +136,12 @@ def _log_overview(stream: "rr.RecordingStream", queries: Localizations) -> None:
 
 
 class _ChosenWriter:
-    """Logs one query at a time; each replaces the one before."""
+    """Logs one query at a time, each in place of the one before; `shift` (3,) is added to all positions."""
 
-    def __init__(self, stream: "rr.RecordingStream", queries: Localizations, camera_depth_m: float) -> None:
-        self._stream, self._queries, self._depth_m = stream, queries, camera_depth_m
+    def __init__(
+        self, stream: rr.RecordingStream, queries: Localizations, camera_depth_m: float, shift: Floats
+    ) -> None:
+        self._stream, self._queries, self._depth_m, self._shift = stream, queries, camera_depth_m, shift
         self._sizes: dict[str, tuple[int, int]] = {}
         """Width and height of the images last logged, by entity."""
         self._jpeg_of = lru_cache(KEPT_JPEGS)(_jpeg_of)
@@ -172,29 +157,28 @@ class _ChosenWriter:
         """Log a query. Entities that it lacks are cleared, or those of the last query would stay."""
         import rerun as rr
 
-        self._stream.set_time(QUERY, sequence=number)
-        for k in range(MAX_CAMERAS):
-            image = query.cameras[k] if k < len(query.cameras) else None
+        stream, references, center = self._stream, query.captioned_references(), self._queries.estimated[number, :3, 3]
+        stream.set_time(QUERY, sequence=number)
+        for k, image in zip_longest(range(MAX_CAMERAS), query.cameras[:MAX_CAMERAS]):
             self._log_image(f"world/chosen/camera_{k}", image, ESTIMATED, residuals=True)
-        references = query.captioned_references()
-        for rank in range(1, REFERENCES + 1):
-            image, _, agrees = references[rank - 1] if rank <= len(references) else (None, "", True)
+        for rank, reference in zip_longest(range(1, REFERENCES + 1), references):
+            image, _, agrees = reference or (None, "", True)
             self._log_image(f"world/references/{rank}", image, SKY if agrees else ORANGE, residuals=False)
         if query.cameras:
             camera, true = query.cameras[0].camera, query.cameras[0].world_from_cam_true
             has_truth = bool(is_posed(true))
             if has_truth:
-                self._stream.log("world/truth/camera_0", viewer.transform_of(true))
-            shown = (camera.width, camera.height)
-            pinhole = viewer.pinhole_of(camera, shown, self._depth_m if has_truth else viewer.HIDDEN_M, TRUE)
-            self._stream.log("world/truth/camera_0", pinhole)
+                stream.log("world/truth/camera_0", viewer.transform_of(shifted(true, self._shift)))
+            depth_m = self._depth_m if has_truth else viewer.HIDDEN_M
+            pinhole = viewer.pinhole_of(camera, (camera.width, camera.height), depth_m, TRUE)
+            stream.log("world/truth/camera_0", pinhole)
         points = np.concatenate([np.zeros((0, 3)), *(image.points[image.inlier] for image in query.cameras)])
-        dots = rr.Points3D(points, colors=viewer.rgb(GREEN), radii=rr.Radius.ui_points(3))
-        self._stream.log("world/chosen_points", dots)
-        center = self._queries.estimated[number, :3, 3]
-        lines = [np.stack([center, image.world_from_cam[:3, 3]]) for image in query.references]
-        located = bool(is_posed(self._queries.estimated[number]))
-        self._stream.log("world/lines", rr.LineStrips3D(lines if located else [], colors=viewer.rgb(ORANGE)))
+        dots = rr.Points3D(points + self._shift, colors=viewer.rgb(GREEN), radii=rr.Radius.ui_points(3))
+        stream.log("world/chosen_points", dots)
+        located = bool(np.isfinite(center).all())
+        ends = [image.world_from_cam[:3, 3] for image in query.references if located]
+        lines = [np.stack([center, end]) + self._shift for end in ends]
+        stream.log("world/lines", rr.LineStrips3D(lines, colors=viewer.rgb(ORANGE)))
         text = [f"**query {number}: {describe(self._queries, number)}**", ""]
         text += [f"- {image.name}" for image in query.cameras]
         if query.has_matches:
@@ -204,31 +188,27 @@ class _ChosenWriter:
         elif located:
             text += ["", "No matches: the pose comes from the references as a whole.", ""]
         text += [f"{rank}. {image.name}: {caption}" for rank, (image, caption, _) in enumerate(references, start=1)]
-        self._stream.log("about", rr.TextDocument("\n".join(text), media_type="text/markdown"))
+        stream.log("about", rr.TextDocument("\n".join(text), media_type="text/markdown"))
 
     def _log_image(self, path: str, image: ShownImage | None, color: str, residuals: bool) -> None:
         """Log an image (None: a gray one) with its camera, keypoints and, for `residuals`, projected points."""
         import rerun as rr
 
-        stream = self._stream
-        measured, inlier = np.zeros((0, 2)), np.zeros(0, bool)
+        stream, measured, inlier = self._stream, np.zeros((0, 2)), np.zeros(0, bool)
         predicted, lines = np.zeros((0, 2)), np.zeros((0, 2, 2))
         if image is None:
             # Keep the size of the last image: the viewer treats the images of an entity as frames of a video.
             width, height = self._sizes.get(path, (4, 3))
-            blank = np.full((height, width, 3), 60, np.uint8)
-            data, _ = viewer.small_jpeg(blank, max(blank.shape))
-            # Any camera that is too small to see.
-            stream.log(path, rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=viewer.HIDDEN_M))
+            data, _ = viewer.small_jpeg(np.full((height, width, 3), 60, np.uint8), max(width, height))
+            stream.log(path, viewer.hidden_camera())
         else:
-            data, shown = self._jpeg_of(image.path)
-            self._sizes[path] = shown
+            data, self._sizes[path] = self._jpeg_of(image.path)
             located = bool(is_posed(image.world_from_cam))
             if located:
-                stream.log(path, viewer.transform_of(image.world_from_cam))
+                stream.log(path, viewer.transform_of(shifted(image.world_from_cam, self._shift)))
             depth_m = self._depth_m if located else viewer.HIDDEN_M
-            stream.log(path, viewer.pinhole_of(image.camera, shown, depth_m, color))
-            scale = np.array(shown) / [image.camera.width, image.camera.height]
+            stream.log(path, viewer.pinhole_of(image.camera, self._sizes[path], depth_m, color))
+            scale = np.array(self._sizes[path]) / [image.camera.width, image.camera.height]
             measured, inlier = image.pixels * scale, image.inlier
             if located and residuals and inlier.any():
                 pixels, visible = project(image.points[inlier], image.camera, image.world_from_cam)
@@ -251,7 +231,7 @@ def _jpeg_of(path: Path) -> tuple[bytes, tuple[int, int]]:
 
 def describe(queries: Localizations, k: int) -> str:
     """Return one line of text about a query: name, status, errors, inliers."""
-    row = queries.table.iloc[k]
+    row = queries.errors.iloc[k]
     parts = [str(queries.names[k]), str(row["status"])]
     if np.isfinite(row["translation_error_m"]):
         parts.append(f"off by {row['rotation_error_deg']:.2g}°, {row['translation_error_m']:.3g} {queries.unit[0]}")

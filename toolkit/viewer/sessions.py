@@ -3,13 +3,15 @@
 import logging
 import time
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import pandas as pd
+import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import ArrayLike
 from tqdm.auto import tqdm
 
@@ -19,19 +21,17 @@ from toolkit.capture.images import decode, default_workers, prefetch, read_for_d
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import ArtifactError, CaptureError, ImageError
 from toolkit.figures.style import ORANGE
-from toolkit.files import file_fingerprint, files_fingerprint, pair_devices, write_sidecar
+from toolkit.files import pair_devices, write_sidecar
 from toolkit.geometry import Floats, Ints, local_origin, shifted
-from toolkit.results.images import sure_points
+from toolkit.results.localized import sure_points
 from toolkit.results.metrics import is_posed
 from toolkit.results.pair import PairResults, load_maps, map_files
 from toolkit.viewer import blueprint as viewer
 
 if TYPE_CHECKING:
     import pycolmap
-    import rerun as rr
 
 logger = logging.getLogger(__name__)
-
 
 FRAME, CAPTURE_TIME = "frame", "capture_time"
 """Timelines: index of the instant in its session, and the timestamp of the files as a duration (microseconds)."""
@@ -41,20 +41,19 @@ MAX_TABS = 12
 
 @dataclass(frozen=True)
 class SessionRecording:
-    """The content of a session's recording."""
+    """The content of a session's recording, in numbers."""
 
     path: Path
     frames: int = 0
-    """Recorded frames: one per device and timestamp."""
+    """One per device and timestamp."""
     images: int = 0
     unreadable: int = 0
-    """Images and depth maps that could not be read; a gray picture replaces an unreadable image."""
+    """Images and depth maps; a gray image replaces an unreadable one."""
     unposed: int = 0
     """Images of frames without a pose, under `unposed/`: shown beside the scene."""
     depth_maps: int = 0
     points: int = 0
     queries: int = 0
-    """Queries drawn in the map."""
     seconds: float = 0.0
     bytes: int = 0
     messages: list[str] = field(default_factory=list)
@@ -118,92 +117,62 @@ def record_session(
         CaptureError: unknown session, subsession or keyframe list.
         ArtifactError: `vis_retrieve_queries` without the h5 of `queries_pose`, or `queries_pose` of another session.
     """
-    import rerun as rr
-
     started = time.perf_counter()
     if every < 1:
         raise CaptureError(f"every={every}: expected 1 (every frame) or more.")
     capture = Capture.open(scene)
     session = capture[f"{device}_{split}"]
     path = Path(out) if out is not None else Path(f"{capture.name}_{session.id}.rrd")
-    if queries_pose is None and vis_retrieve_queries:
+    localized = None
+    if queries_pose is not None:
+        localized = _QueryPoses.read(Path(queries_pose), capture, session, vis_retrieve_queries)
+    elif vis_retrieve_queries:
         raise ArtifactError("vis_retrieve_queries shows the references of `queries_pose`; give that file too.")
-    poses = None if queries_pose is None else Path(queries_pose)
-    localized = None if poses is None else _QueryPoses.read(poses, capture, session, vis_retrieve_queries)
     map_device = device if split == "map" else "" if localized is None else localized.map_device
     maps = map_files(map_dir, f"{map_device}_map", localized.h5 if localized else None) if map_device else ()
-    settings = {
-        "images": session.files_fingerprint, "subsession": subsession,
-        "session": files_fingerprint([*sorted(session.path.glob("*.txt")), *sorted(session.path.glob("proc/*.txt"))]),
-        "keyframes": queries if keyframes_only else "", "every": every,
-        "image_size": image_size, "quality": viewer.JPEG_QUALITY,
-        "queries_pose": "" if poses is None else file_fingerprint(poses), "retrieve": vis_retrieve_queries,
-        "points": files_fingerprint(list(maps)),
-        "world_up": None if world_up is None else np.asarray(world_up, float).tolist(),
-    }  # fmt: skip
-    plan = _Plan.of(session, subsession, queries if keyframes_only else None, every, localized)
-    placed = plan.all_poses[is_posed(plan.all_poses)]
+    estimated = localized.poses if localized is not None and split == "query" else None
+    frames, tracks, origin = _frames_of(session, subsession, queries if keyframes_only else None, every, estimated)
+    rows = [frame.rows[0] for frame in frames]
+    placed = np.array([frame.world_from_device for frame in frames]).reshape(-1, 4, 4) @ session.rig_from_cam(rows)
+    placed = placed[is_posed(placed)]
     up = np.asarray(up_of_cameras(placed) if world_up is None else world_up, np.float64)
-    local_map = load_maps(maps)
-    messages = []
+    local_map, messages = load_maps(maps), []
     if not len(placed):
         messages.append(f"{session.id}: no frame has a pose, so images are shown beside the scene.")
     if map_dir is not None and local_map is None:
         messages.append(f"{map_dir}: holds no map for this recording, so no points are shown.")
-    counts = Counter(frames=len(plan.frames))
-    with viewer.open_recording(path, f"{capture.name}_{session.id}", _session_layout(plan, placed, up)) as stream:
+    counts = Counter(frames=len(frames))
+    with viewer.open_recording(path, f"{capture.name}_{session.id}", _layout(session, frames, placed, up)) as stream:
         stream.log("world", viewer.world_axes(up), static=True)
         if local_map is not None:
             points, colors = sure_points(local_map)
-            viewer.log_points(stream, points - plan.origin, colors)
+            viewer.log_points(stream, points - origin, colors)
             counts["points"] = len(points)
-        color = viewer.rgb(color_of(session.device))
-        for name, tracks in plan.tracks.items():
+        for name, of_devices in tracks.items():
             # One line per track: joined, they would show paths that nobody took.
-            lines = rr.LineStrips3D([track for track in tracks if len(track) > 1], colors=color)
-            stream.log(f"world/{viewer.entity(name)}/trajectory", lines, static=True)
+            lines = [track for track in of_devices if len(track) > 1]
+            viewer.log_lines(stream, f"world/{viewer.entity(name)}/trajectory", lines, color_of(session.device))
         if localized is not None:
-            _log_queries(stream, localized, session, plan.origin)
+            _log_queries(stream, localized, session, origin)
             counts["queries"] = len(localized.poses)
+        reader = _Reader.of(session, image_size)
         writer = _FrameWriter(stream, viewer.camera_depth_m(placed[:, :3, 3]), color_of(session.device))
-        writer.announce(plan.frames)
-
-        def load(number: int) -> list[_Shot]:
-            return [_load(shot, image_size) for shot in plan.shots(number)]
-
-        loaded = prefetch(load, range(len(plan.frames)), default_workers())
-        bar = tqdm(loaded, total=len(plan.frames), desc=session.id, unit="frame", disable=not progress)
-        for frame, shots in zip(plan.frames, bar, strict=True):
+        writer.announce(frames)
+        loaded = prefetch(reader.read, frames, default_workers())
+        bar = tqdm(loaded, total=len(frames), desc=session.id, unit="frame", disable=not progress)
+        for frame, shots in zip(frames, bar, strict=True):
             counts.update(writer.write(frame, shots))
-        writer.finish()
+        writer.end_subsession()
     if counts["unreadable"]:
         messages.append(f"{session.id}: {counts['unreadable']} images or depth maps cannot be read.")
-    seconds, size_bytes = round(time.perf_counter() - started, 2), path.stat().st_size
-    write_sidecar(path, settings, made_from=[] if queries_pose is None else [queries_pose])
-    recording = SessionRecording(path, **counts, seconds=seconds, bytes=size_bytes, messages=messages)
+    write_sidecar(path, {"every": every}, made_from=[] if queries_pose is None else [queries_pose])
+    seconds = round(time.perf_counter() - started, 2)
+    recording = SessionRecording(path, **counts, seconds=seconds, bytes=path.stat().st_size, messages=messages)
     logger.info("%s: %d frames, %d images in %.0f s, %.1f MB", path, recording.frames, recording.images, seconds,
-                size_bytes / 1e6)  # fmt: skip
+                recording.bytes / 1e6)  # fmt: skip
     if spawn:
         viewer.spawn_viewer(path)
     return recording
-
-
-@dataclass(frozen=True)
-class _Shot:
-    """An image or depth map of a frame: where to read it and where to log it; once read, also the data to show."""
-
-    slot: str
-    """Name of its camera in the recording, the same in all frames."""
-    camera: "pycolmap.Camera"
-    parent_from_sensor: Floats
-    """rig_from_cam (4, 4); world_from_cam for a camera without a rig. NaN without a pose."""
-    path: Path
-    is_depth: bool = False
-    data: bytes = b""
-    """JPEG, or 16-bit PNG in millimeters; empty if a depth map cannot be read."""
-    size: tuple[int, int] = (0, 0)
-    """Width and height as shown, pixels."""
-    readable: bool = False
 
 
 @dataclass(frozen=True)
@@ -222,7 +191,7 @@ class _Frame:
     rows: Ints
     """Rows of its images in the session."""
     slots: tuple[str, ...]
-    """Names of the images' cameras in the recording."""
+    """Names of the images' cameras in the recording, the same in all frames."""
 
     @property
     def posed(self) -> bool:
@@ -235,85 +204,38 @@ class _Frame:
         return viewer.entity(*parts)
 
 
-@dataclass
-class _Plan:
-    """The frames of a session to record; no image is read yet."""
+def _frames_of(
+    session: Session, subsession: str, keyframes: str | None, every: int, estimated: Trajectory | None
+) -> tuple[list[_Frame], dict[str, list[Floats]], Floats]:
+    """Return the frames to record, no image is read yet; the tracks; and the origin (3,) of both.
 
-    session: Session
-    frames: list[_Frame]
-    tracks: dict[str, list[Floats]]
-    """World positions (n, 3) of each device, by subsession; of all frames, also those that thinning drops."""
-    all_poses: Floats
-    """world_from_cam (n, 4, 4) of one camera of each frame in `frames`."""
-    depths: dict[tuple[int, str], list[int]]
-    """Rows of the session's depth maps by timestamp and device."""
-    rig_from_depth: Floats
-    origin: Floats
-    """(3,) what is subtracted from all world positions."""
-
-    @classmethod
-    def of(
-        cls, session: Session, subsession: str, keyframes: str | None, every: int, localized: "_QueryPoses | None"
-    ) -> "_Plan":
-        if subsession != "all" and subsession not in session.subsessions:
-            raise CaptureError(
-                f"Session {session.id} has no subsession {subsession!r}; known: {', '.join(session.subsessions)}, all."
-            )
-        table = _slots(session)
-        if subsession != "all":
-            table = table[table["subsession"] == subsession]
-        trajectory = session.ground_truth if session.split == "query" else session.trajectory
-        if localized is not None and session.split == "query":
-            trajectory = localized.poses
-        first = table.drop_duplicates(["index", "device_slot"])
-        poses = np.full((len(first), 4, 4), np.nan)
-        if trajectory is not None:
-            poses = trajectory.lookup(first["timestamp"].to_numpy(), first["device_id"].to_numpy(str))
-        origin = local_origin(poses[is_posed(poses), :3, 3])
-        poses = shifted(poses, -origin)
-        shown = np.ones(len(first), bool)
-        if keyframes is not None:
-            listed = pd.MultiIndex.from_frame(session.keyframes(keyframes)[["timestamp", "device_id"]].astype(object))
-            shown = pd.MultiIndex.from_frame(first[["timestamp", "device_id"]].astype(object)).isin(listed)
-        kept = np.unique(first["index"].to_numpy()[shown])[::every]
-        shown &= np.isin(first["index"], kept)
-        rows_of = table.groupby(["index", "device_slot"], sort=False).indices
-        image_rows, slots = table["row"].to_numpy(), table["slot"].to_numpy()
-        columns = first.loc[shown, ["index", "timestamp", "subsession", "device_slot", "device_id"]]
-        frames = []
-        for values, pose in zip(columns.itertuples(index=False, name=None), poses[shown], strict=True):
-            index, timestamp, name, device, device_id = values
-            rows = rows_of[index, device]
-            frames.append(
-                _Frame(index, timestamp, name, device, device_id, pose, image_rows[rows], tuple(slots[rows]))
-            )
-        rows = np.array([frame.rows[0] for frame in frames], np.int64)
-        cameras = poses[shown] @ session.rig_from_cam(rows) if len(rows) else np.zeros((0, 4, 4))
-        depths: dict[tuple[int, str], list[int]] = {}
-        rig_from_depth = np.zeros((0, 4, 4))
-        if session.depths is not None:
-            times = session.depths["timestamp"].to_numpy(np.int64)
-            devices, rig_from_depth = session.devices_of(times, session.depths["sensor_id"])
-            for row, key in enumerate(zip(times.tolist(), devices.tolist(), strict=True)):
-                depths.setdefault(key, []).append(row)
-        return cls(session, frames, _tracks(first, poses), cameras, depths, rig_from_depth, origin)
-
-    def shots(self, number: int) -> list[_Shot]:
-        """Return the images and depth maps to read for a frame."""
-        frame, session = self.frames[number], self.session
-        in_rig = frame.device != ""
-        sensors, poses = session.images["sensor_id"].iloc[frame.rows].tolist(), session.rig_from_cam(frame.rows)
-        shots = [
-            _Shot(slot, session.camera(sensor), pose if in_rig else frame.world_from_device, session.image_path(row))
-            for slot, sensor, pose, row in zip(frame.slots, sensors, poses, frame.rows.tolist(), strict=True)
-        ]
-        slot_of = dict(zip(sensors, frame.slots, strict=True))
-        for rank, row in enumerate(self.depths.get((frame.timestamp, frame.device_id), [])):
-            sensor, path = session.depths[["sensor_id", "path"]].iloc[row]  # type: ignore[index]
-            pose, slot = self.rig_from_depth[row] if in_rig else frame.world_from_device, slot_of.get(sensor, rank)
-            file = session.path / RAW_DATA / path
-            shots.append(_Shot(f"{slot}_depth", session.camera(sensor), pose, file, is_depth=True))
-        return shots
+    Tracks are world positions (n, 3) of each device, by subsession; of all frames, also those that thinning drops.
+    """
+    if subsession not in ("all", *session.subsessions):
+        raise CaptureError(
+            f"Session {session.id} has no subsession {subsession!r}; known: {', '.join(session.subsessions)}, all."
+        )
+    table, key = _slots(session), ["timestamp", "device_id"]
+    if subsession != "all":
+        table = table[table["subsession"] == subsession]
+    first = table.drop_duplicates(["instant", "device_slot"])
+    trajectory = estimated or (session.ground_truth if session.split == "query" else session.trajectory)
+    poses = np.full((len(first), 4, 4), np.nan)
+    if trajectory is not None:
+        poses = trajectory.lookup(first["timestamp"].to_numpy(), first["device_id"].to_numpy(str))
+    origin = local_origin(poses[is_posed(poses), :3, 3])
+    poses, shown = shifted(poses, -origin), np.ones(len(first), bool)
+    if keyframes is not None:
+        of_frames, listed = (each[key].astype(object) for each in (first, session.keyframes(keyframes)))
+        shown = pd.MultiIndex.from_frame(of_frames).isin(pd.MultiIndex.from_frame(listed))
+    shown &= np.isin(first["instant"], np.unique(first["instant"].to_numpy()[shown])[::every])
+    of_frame = table.groupby(["instant", "device_slot"], sort=False).indices
+    rows, slots, frames = table["row"].to_numpy(), table["slot"].to_numpy(), []
+    for one, pose in zip(first[shown].itertuples(), poses[shown], strict=True):
+        images = of_frame[one.instant, one.device_slot]
+        device = one.subsession, one.device_slot, one.device_id
+        frames.append(_Frame(one.instant, one.timestamp, *device, pose, rows[images], tuple(slots[images])))
+    return frames, _tracks(first, poses), origin
 
 
 def session_tracks(session: Session) -> list[Floats]:
@@ -321,7 +243,7 @@ def session_tracks(session: Session) -> list[Floats]:
 
     A rig's track is that of its first camera. Maps have the poses of the trajectory, queries those of the ground truth.
     """
-    first = _slots(session).drop_duplicates(["index", "device_slot"])
+    first = _slots(session).drop_duplicates(["instant", "device_slot"])
     poses = session.world_from_cam(first["row"].to_numpy(), session.split == "query")
     return [track for tracks in _tracks(first, poses).values() for track in tracks]
 
@@ -339,7 +261,7 @@ def _tracks(frames: pd.DataFrame, poses: Floats) -> dict[str, list[Floats]]:
 def _slots(session: Session) -> pd.DataFrame:
     """Return the images of a session in order of subsession and time, with names for their cameras and rigs.
 
-    Columns row, subsession, timestamp, device_id, index (of the instant), slot, device_slot. Some captures make new
+    Columns row, subsession, timestamp, device_id, instant (its number), slot, device_slot. Some captures make new
     sensor ids for each frame: an id that occurs once in a subsession of several instants. Such a camera is named by its
     rank in the frame, so that it keeps its name.
     """
@@ -354,11 +276,11 @@ def _slots(session: Session) -> pd.DataFrame:
     })  # fmt: skip
     table["rank"] = table["subsession"].map(order).fillna(len(order))
     table = table.sort_values(["rank", "subsession", "timestamp", "device_id", "sensor_id"], ignore_index=True)
-    instant = ["subsession", "timestamp"]
-    table["index"] = table.groupby(instant, sort=False).ngroup()
-    rigs = _stable_names(table, "device_id", instant, "rig")
+    at = ["subsession", "timestamp"]
+    table["instant"] = table.groupby(at, sort=False).ngroup()
+    rigs = _stable_names(table, "device_id", at, "rig")
     table["device_slot"] = rigs.where(table["device_id"] != table["sensor_id"], "")
-    table["slot"] = _stable_names(table, "sensor_id", [*instant, "device_slot"], "camera")
+    table["slot"] = _stable_names(table, "sensor_id", [*at, "device_slot"], "camera")
     return table
 
 
@@ -373,99 +295,140 @@ def _stable_names(table: pd.DataFrame, column: str, frame: list[str], kind: str)
     return pd.Series(names, index=table.index, dtype=object)
 
 
-def _load(shot: _Shot, image_size: int) -> _Shot:
-    """Read an image or depth map and reduce it; thread-safe."""
-    if shot.is_depth:
+@dataclass(frozen=True)
+class _Shot:
+    """An image or depth map of a frame, reduced: where to log it, and what."""
+
+    slot: str
+    """Name of its camera in the recording."""
+    camera: "pycolmap.Camera"
+    parent_from_sensor: Floats
+    """rig_from_cam (4, 4); world_from_cam for a camera without a rig. NaN without a pose."""
+    data: bytes
+    """JPEG, or 16-bit PNG in millimeters; empty if a depth map cannot be read."""
+    size: tuple[int, int]
+    """Width and height as shown, pixels."""
+    readable: bool
+    is_depth: bool = False
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """Reads the images and depth maps of frames; thread-safe."""
+
+    session: Session
+    image_size: int
+    depths: dict[tuple[int, str], Ints]
+    """Rows of the session's depth maps by timestamp and device."""
+    rig_from_depth: Floats
+
+    @classmethod
+    def of(cls, session: Session, image_size: int) -> "_Reader":
+        if session.depths is None:
+            return cls(session, image_size, {}, np.zeros((0, 4, 4)))
+        times = session.depths["timestamp"].to_numpy(np.int64)
+        devices, rig_from_depth = session.devices_of(times, session.depths["sensor_id"])
+        return cls(session, image_size, pd.DataFrame([times, devices]).T.groupby([0, 1]).indices, rig_from_depth)
+
+    def read(self, frame: _Frame) -> list[_Shot]:
+        """Return the images and depth maps of a frame."""
+        session, shots = self.session, []
+        sensors, poses = session.images["sensor_id"].iloc[frame.rows].tolist(), session.rig_from_cam(frame.rows)
+        for slot, sensor, pose, row in zip(frame.slots, sensors, poses, frame.rows.tolist(), strict=True):
+            camera, pose = session.camera(sensor), pose if frame.device else frame.world_from_device
+            shots.append(_Shot(slot, camera, pose, *self._image(session.image_path(row), camera)))
+        slot_of = dict(zip(sensors, frame.slots, strict=True))
+        for rank, row in enumerate(self.depths.get((frame.timestamp, frame.device_id), [])):
+            sensor, path = session.depths[["sensor_id", "path"]].iloc[row]  # type: ignore[index]
+            pose = self.rig_from_depth[row] if frame.device else frame.world_from_device
+            slot, read = f"{slot_of.get(sensor, rank)}_depth", self._depth(session.path / RAW_DATA / path)
+            shots.append(_Shot(slot, session.camera(sensor), pose, *read, is_depth=True))
+        return shots
+
+    def _image(self, path: Path, camera: "pycolmap.Camera") -> tuple[bytes, tuple[int, int], bool]:
         try:
-            depth = decode(shot.path, cv2.IMREAD_UNCHANGED)
+            image, readable = read_image(path, longest=self.image_size), True
         except ImageError:
-            return shot
+            blank = cv2.resize(read_for_display(path, self.image_size), (camera.width, camera.height))
+            image, readable = np.asarray(blank, np.uint8), False
+        return *viewer.small_jpeg(image, self.image_size), readable
+
+    def _depth(self, path: Path) -> tuple[bytes, tuple[int, int], bool]:
+        try:
+            depth = decode(path, cv2.IMREAD_UNCHANGED)
+        except ImageError:
+            return b"", (0, 0), False
         if depth.dtype != np.uint16 or depth.ndim != 2:
-            return shot
-        scale = min(1.0, image_size / 2 / max(depth.shape))
+            return b"", (0, 0), False
+        scale = min(1.0, self.image_size / 2 / max(depth.shape))
         width, height = (max(1, round(scale * side)) for side in depth.shape[::-1])
         # Nearest: averages across depth edges would float in the air.
         small = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST)
-        data = cv2.imencode(".png", small)[1].tobytes()
-        return replace(shot, data=data, size=(width, height), readable=True)
-    try:
-        image, readable = read_image(shot.path, longest=image_size), True
-    except ImageError:
-        blank = cv2.resize(read_for_display(shot.path, image_size), (shot.camera.width, shot.camera.height))
-        image, readable = np.asarray(blank, np.uint8), False
-    data, size = viewer.small_jpeg(image, image_size)
-    return replace(shot, data=data, size=size, readable=readable)
+        return cv2.imencode(".png", small)[1].tobytes(), (width, height), True
 
 
 class _FrameWriter:
     """Logs frames in order; poses and intrinsics that have not changed are not logged again."""
 
-    def __init__(self, stream: "rr.RecordingStream", size: float, color: str) -> None:
+    def __init__(self, stream: rr.RecordingStream, size: float, color: str) -> None:
         self._stream, self._size, self._color = stream, size, color
-        self._last: dict[tuple[str, str], tuple[float, ...]] = {}
+        self._last: dict[tuple[str, str], list[float]] = {}
         """Values last logged, by entity and kind."""
-        self._visible: dict[tuple[str, str], dict[str, _Shot]] = {}
-        """Cameras that are shown now: shots by entity, by subsession and device."""
-        self._last_frame: _Frame | None = None
+        self._visible: dict[str, dict[str, _Shot]] = {}
+        """Cameras that are shown now: shots by entity, by device."""
+        self._frame: _Frame | None = None
 
     def write(self, frame: _Frame, shots: list[_Shot]) -> Counter[str]:
         """Log a frame; return the counts of its images and depth maps by kind."""
         import rerun as rr
 
-        if self._last_frame is not None and self._last_frame.subsession != frame.subsession:
-            self.finish()
-        self._last_frame = frame
+        if self._frame is not None and self._frame.subsession != frame.subsession:
+            self.end_subsession()
+        self._frame = frame
         self._set_time(frame.index, frame.timestamp)
         if frame.posed and frame.device:
             self._stream.log(frame.entity, viewer.transform_of(frame.world_from_device))
         shown: dict[str, _Shot] = {}
-        counts: Counter[str] = Counter()
-        for shot in shots:
-            counts["unreadable"] += not shot.readable
-            if not shot.data:
-                continue
+        counts: Counter[str] = Counter(unreadable=sum(not shot.readable for shot in shots))
+        for shot in (shot for shot in shots if shot.data):
             path = f"{frame.entity}/{viewer.entity(shot.slot)}"
             shown[path] = shot
-            if frame.posed:
-                pose = shot.parent_from_sensor
-                self._log_changed(path, "pose", pose, lambda pose=pose: viewer.transform_of(pose))
-            intrinsics = [*viewer.shown_intrinsics(shot.camera, shot.size).ravel(), *shot.size]
-            self._log_changed(path, "pinhole", intrinsics, lambda s=shot: self._pinhole(s, self._size))
+            if frame.posed and self._has_changed(path, "pose", shot.parent_from_sensor):
+                self._stream.log(path, viewer.transform_of(shot.parent_from_sensor))
+            intrinsics = np.append(viewer.shown_intrinsics(shot.camera, shot.size), shot.size)
+            if self._has_changed(path, "pinhole", intrinsics):
+                self._stream.log(path, viewer.pinhole_of(shot.camera, shot.size, self._size, self._color))
             if shot.is_depth:
                 depth = rr.EncodedDepthImage(shot.data, media_type="image/png", meter=DEPTH_SCALE)
                 self._stream.log(f"{path}/depth", depth)
-                counts["depth_maps"] += 1
             else:
                 self._stream.log(f"{path}/image", rr.EncodedImage(contents=shot.data, media_type="image/jpeg"))
-                counts["images"] += 1
-                counts["unposed"] += not frame.posed
+            counts["depth_maps" if shot.is_depth else "images"] += 1
+            counts["unposed"] += not (frame.posed or shot.is_depth)
         # Hide the device's cameras of the last frame that this frame lacks, or they would stay at their old place.
-        device = (frame.subsession, frame.device or frame.slots[0])
+        device = frame.device or frame.slots[0]
         self._hide({path: last for path, last in self._visible.get(device, {}).items() if path not in shown})
         self._visible[device] = shown
         return counts
 
     def announce(self, frames: list[_Frame]) -> None:
         """Log cameras that appear later, too small to see: the viewer complains about images without a camera."""
-        import rerun as rr
-
         if not frames:
             return
         self._set_time(frames[0].index, min(frame.timestamp for frame in frames))
-        first_index: dict[str, int] = {}
-        for frame in frames:
-            for slot in frame.slots if frame.posed else ():
-                first_index.setdefault(f"{frame.entity}/{viewer.entity(slot)}", frame.index)
-        for path, index in first_index.items():
-            if index > frames[0].index:
-                hidden = rr.Pinhole(focal_length=1, width=1, height=1, image_plane_distance=viewer.HIDDEN_M)
-                self._stream.log(path, hidden)
+        first = {
+            f"{frame.entity}/{viewer.entity(slot)}": frame.index
+            for frame in reversed(frames)
+            if frame.posed
+            for slot in frame.slots
+        }
+        for path in (path for path, index in first.items() if index > frames[0].index):
+            self._stream.log(path, viewer.hidden_camera())
 
-    def finish(self) -> None:
-        """End a subsession: hide all its cameras in the instant after its last frame."""
-        if self._last_frame is None:
-            return
-        self._set_time(self._last_frame.index + 1, self._last_frame.timestamp + 1)
+    def end_subsession(self) -> None:
+        """Hide all cameras in the instant after the last frame."""
+        if self._frame is not None:
+            self._set_time(self._frame.index + 1, self._frame.timestamp + 1)
         for shown in self._visible.values():
             self._hide(shown)
         self._visible.clear()
@@ -474,34 +437,30 @@ class _FrameWriter:
         self._stream.set_time(FRAME, sequence=index)
         self._stream.set_time(CAPTURE_TIME, duration=np.timedelta64(timestamp, "us"))
 
-    def _pinhole(self, shot: _Shot, depth_m: float) -> "rr.Pinhole":
-        return viewer.pinhole_of(shot.camera, shot.size, depth_m, self._color)
-
     def _hide(self, cameras: dict[str, _Shot]) -> None:
         for path, shot in cameras.items():
-            self._stream.log(path, self._pinhole(shot, viewer.HIDDEN_M))
+            self._stream.log(path, viewer.pinhole_of(shot.camera, shot.size, viewer.HIDDEN_M, self._color))
             self._last.pop((path, "pinhole"), None)
 
-    def _log_changed(self, path: str, kind: str, numbers: ArrayLike, make: Any) -> None:
-        values = tuple(np.ravel(numbers).tolist())
-        if self._last.get((path, kind)) != values:
-            self._stream.log(path, make())
-            self._last[path, kind] = values
+    def _has_changed(self, path: str, kind: str, numbers: Floats) -> bool:
+        """Return whether numbers differ from those last asked about."""
+        values = numbers.ravel().tolist()
+        changed = self._last.get((path, kind)) != values
+        self._last[path, kind] = values
+        return changed
 
 
-def _session_layout(plan: _Plan, poses: Floats, up: Floats) -> Any:
+def _layout(session: Session, frames: list[_Frame], poses: Floats, up: Floats) -> Any:
     """Return the viewer's layout: the scene, and beside it a tab for each subsession with its cameras."""
-    import rerun.blueprint as rrb
-
     tabs: dict[str, dict[str, str]] = {}
-    for frame in plan.frames:
+    for frame in frames:
         for slot in frame.slots:
             tabs.setdefault(frame.subsession, {})[f"{frame.entity}/{viewer.entity(slot)}"] = slot
     views = [
         rrb.Grid(*[rrb.Spatial2DView(origin=path, name=slot) for path, slot in cameras.items()], name=name)
         for name, cameras in list(tabs.items())[:MAX_TABS]
     ]
-    scene = viewer.scene_view(poses, up, plan.session.id)
+    scene = viewer.scene_view(poses, up, session.id)
     panel = rrb.TimePanel(state="collapsed", timeline=FRAME, play_state="paused")
     layout = rrb.Horizontal(scene, rrb.Tabs(*views), column_shares=[2, 1]) if views else rrb.Horizontal(scene)
     return rrb.Blueprint(layout, panel, collapse_panels=True)
@@ -522,49 +481,39 @@ class _QueryPoses:
 
     @classmethod
     def read(cls, path: Path, capture: Capture, session: Session, with_references: bool) -> "_QueryPoses":
-        poses = Trajectory.read(path)
-        prefix = f"{capture.name}_map_"
-        map_device, query_device = pair_devices(path.stem) if path.stem.startswith(prefix) else ("", "")
-        is_pair = map_device != ""
-        h5 = path.with_name(f"{path.stem.removesuffix('_sequence')}.h5")
-        device = map_device if session.split == "map" else query_device
-        if is_pair and device != session.device:
+        poses, prefix, lines = Trajectory.read(path), f"{capture.name}_map_", list[Floats]()
+        mapped, queried = pair_devices(path.stem) if path.stem.startswith(prefix) else ("", "")
+        if mapped and session.device != (mapped if session.split == "map" else queried):
             raise ArtifactError(
-                f"{path.name} holds {query_device} queries in the {map_device} map, which has nothing to do with "
+                f"{path.name} holds {queried} queries in the {mapped} map, which has nothing to do with "
                 f"session {session.id}. Expected a file for that device."
             )
-        if not with_references:
-            return cls(poses, map_device, query_device, h5, [])
-        if not is_pair:
-            raise ArtifactError(
-                f"{path}: the references of its queries are in the h5 file of a pair, {prefix}<M>_query_<Q>.h5, but "
-                "this file is not named after a pair. Give the poses of a pair, or leave out vis_retrieve_queries."
-            )
-        results, map_session = PairResults.open(h5), capture[f"{map_device}_map"]
-        centers = map_session.world_from_cam()[:, :3, 3]
-        center_of = dict(zip(map_session.image_names, centers, strict=True))
-        # The poses may be those of the sequence stage.
-        own = poses.lookup(results.table["timestamp"], results.table["device_id"])
-        lines = [
-            np.stack([pose[:3, 3], center_of[name]])
-            for result, pose in zip(results, own, strict=True)
-            for name in result.references
-            if name in center_of and is_posed(pose)
-        ]
-        return cls(poses, map_device, query_device, h5, lines)
+        h5 = path.with_name(f"{path.stem.removesuffix('_sequence')}.h5")
+        if with_references:
+            if not mapped:
+                raise ArtifactError(
+                    f"{path}: the references of its queries are in the h5 file of a pair, {prefix}<M>_query_<Q>.h5, "
+                    "but this file is not named after a pair. Give the poses of a pair, or leave out "
+                    "vis_retrieve_queries."
+                )
+            results, map_session = PairResults.open(h5), capture[f"{mapped}_map"]
+            center_of = dict(zip(map_session.image_names, map_session.world_from_cam()[:, :3, 3], strict=True))
+            # The poses may be those of the sequence stage.
+            own = poses.lookup(results.table["timestamp"], results.table["device_id"])
+            for result, pose in zip(results, own, strict=True):
+                names = [name for name in result.references if name in center_of and is_posed(pose)]
+                lines += [np.stack([pose[:3, 3], center_of[name]]) for name in names]
+        return cls(poses, mapped, queried, h5, lines)
 
 
-def _log_queries(stream: "rr.RecordingStream", queries: _QueryPoses, session: Session, origin: Floats) -> None:
+def _log_queries(stream: rr.RecordingStream, queries: _QueryPoses, session: Session, origin: Floats) -> None:
     """Log the positions of queries (in a map session), and lines from queries to their references, from an origin."""
-    import rerun as rr
-
     poses = queries.poses
     if session.split == "map":
         labels = [f"{time} {device}" for time, device in zip(poses.timestamps, poses.device_ids, strict=True)]
-        centers = poses.world_from_device[:, :3, 3] - origin
-        dots = rr.Points3D(centers, colors=viewer.rgb(color_of(queries.query_device)), radii=rr.Radius.ui_points(4),
-                           labels=labels, show_labels=False)  # fmt: skip
+        centers, color = poses.world_from_device[:, :3, 3] - origin, viewer.rgb(color_of(queries.query_device))
+        radius = rr.Radius.ui_points(4)
+        dots = rr.Points3D(centers, colors=color, radii=radius, labels=labels, show_labels=False)
         stream.log("world/queries/poses", dots, static=True)
     if queries.lines:
-        lines = rr.LineStrips3D([line - origin for line in queries.lines], colors=viewer.rgb(ORANGE))
-        stream.log("world/queries/references", lines, static=True)
+        viewer.log_lines(stream, "world/queries/references", [line - origin for line in queries.lines], ORANGE)

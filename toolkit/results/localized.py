@@ -1,6 +1,6 @@
 """Images of localized queries and of their references, with correspondences, as figures and the viewer draw them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,22 +10,18 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from toolkit import geometry
 from toolkit.capture import Capture, Session
-from toolkit.geometry import Floats, Ints, invert
+from toolkit.geometry import Floats, Ints
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.result import Correspondences, QueryResult
+from toolkit.pose.result import QueryResult
 from toolkit.results.metrics import is_posed
 from toolkit.results.pair import PairResults
 
 if TYPE_CHECKING:
     import pycolmap
 
-
 REFERENCES = 4
 """References shown per query, at most."""
-
-
 MAX_POINTS = 1_000_000
 """Points of a map that are shown, at most: a viewer needs about 30 bytes for each."""
 
@@ -68,14 +64,10 @@ class ShownImage:
     def num_inliers(self) -> int:
         return int(self.inlier.sum())
 
-    def shifted(self, offset: Floats) -> "ShownImage":
-        """Return the image in a world whose origin is shifted: `offset` (3,) is added to all positions."""
-        return replace(
-            self,
-            points=self.points + offset,
-            world_from_cam=geometry.shifted(self.world_from_cam, offset),
-            world_from_cam_true=geometry.shifted(self.world_from_cam_true, offset),
-        )
+    @property
+    def ratio(self) -> float:
+        """Width by height."""
+        return float(self.camera.width / self.camera.height)
 
 
 _OF_A_MATCH = ("pixels", "points", "matches", "inlier", "found_by")
@@ -96,11 +88,6 @@ class QueryDetails:
     def has_matches(self) -> bool:
         """Whether the method matched keypoints, rather than used the poses of whole references."""
         return any(len(camera.matches) for camera in self.cameras)
-
-    def shifted(self, offset: Floats) -> "QueryDetails":
-        """Return the images in a world whose origin is shifted, see `ShownImage.shifted`."""
-        groups = (self.cameras, self.references, self.rejected)
-        return QueryDetails(*([image.shifted(offset) for image in images] for images in groups))
 
     def of_first_camera(self) -> "QueryDetails":
         """Return the first image alone, and references with only its correspondences."""
@@ -123,8 +110,7 @@ class QueryDetails:
 
 def support_of(row: pd.Series) -> str:
     """Return the support of the pose in a row of a pair's csv as text, such as `120 inliers`."""
-    # Older runs name the method `vggt`.
-    by_network = str(row.get("method", "")).rpartition("/")[2].startswith(("feed_forward", "vggt"))
+    by_network = str(row.get("method", "")).rpartition("/")[2].startswith("feed_forward")
     return f"{row['num_inliers']:.0f} {'consistent references' if by_network else 'inliers'}"
 
 
@@ -133,8 +119,8 @@ class Localizations:
     """The queries of a pair, one row each; a rig is represented by its first image."""
 
     names: Sequence[str]
-    table: pd.DataFrame
-    """`PairResults.errors`: the pair's csv with the errors of the device."""
+    errors: pd.DataFrame
+    """The pair's csv with the errors of the rig, see `PairResults.errors`."""
     estimated: Floats
     """world_from_cam (Q, 4, 4), NaN without a pose."""
     true: Floats
@@ -143,15 +129,6 @@ class Localizations:
     """World position (Q, 3) of the first reference of each query without a pose; else NaN."""
     unit: tuple[str, float] = ("m", 1.0)
     """Unit that lengths are shown in, see `metrics.length_unit`."""
-
-    def shifted(self, offset: Floats) -> "Localizations":
-        """Return the queries in a world whose origin is shifted, see `ShownImage.shifted`."""
-        return replace(
-            self,
-            estimated=geometry.shifted(self.estimated, offset),
-            true=geometry.shifted(self.true, offset),
-            nearest_reference=self.nearest_reference + offset,
-        )
 
 
 @dataclass
@@ -191,28 +168,28 @@ class LocalizedPair:
 
     @cached_property
     def true_poses(self) -> Floats:
-        """world_from_rig (Q, 4, 4); NaN where unknown."""
-        first = [rows[0] for rows in self.rows]
-        true = self.query_session.world_from_cam(first, ground_truth=True)
-        return np.asarray(true @ invert(self.query_session.rig_from_cam(first)))
-
-    @cached_property
-    def table(self) -> pd.DataFrame:
-        """The pair's csv with the errors, see `PairResults.errors`."""
-        return self.results.errors(self.true_poses)
+        """True world_from_rig (Q, 4, 4), NaN where unknown."""
+        truth, table = self.query_session.ground_truth, self.results.table
+        unknown = np.full((len(table), 4, 4), np.nan)
+        return unknown if truth is None else truth.lookup(table["timestamp"].to_numpy(), table["device_id"])
 
     @cached_property
     def localizations(self) -> Localizations:
-        session, first = self.query_session, [int(rows[0]) for rows in self.rows]
-        estimated = self.results.poses @ session.rig_from_cam(first)
+        session, row_of_name = self.query_session, self.map_session.row_of_name
+        first = np.array([rows[0] for rows in self.rows], np.int64)
+        rig_from_cam = session.rig_from_cam(first)
         centers = np.full((len(first), 3), np.nan)
-        for k in np.flatnonzero(~is_posed(estimated)):
-            names = [name for name in self.results[int(k)].references if name in self.map_session.row_of_name]
-            if names:
-                centers[k] = self.map_session.world_from_cam([self.map_session.row_of_name[names[0]]])[0, :3, 3]
-        names = [session.image_name(row) for row in first]
-        true = session.world_from_cam(first, ground_truth=True)
-        return Localizations(names, self.table, estimated, true, centers, self.results.unit)
+        for k in np.flatnonzero(~is_posed(self.results.poses)):
+            if known := [row_of_name[name] for name in self.results[int(k)].references if name in row_of_name]:
+                centers[k] = self.map_session.world_from_cam(known[:1])[0, :3, 3]
+        return Localizations(
+            [session.image_name(int(row)) for row in first],
+            self.results.errors(self.true_poses),
+            self.results.poses @ rig_from_cam,
+            self.true_poses @ rig_from_cam,
+            centers,
+            self.results.unit,
+        )
 
     def details(self, k: int, result: QueryResult | None = None) -> QueryDetails:
         """Return images, correspondences and references of query k, as stored or of another result."""
@@ -222,41 +199,30 @@ class LocalizedPair:
         found, cameras = query.correspondences, []
         for row, world_from_cam in zip(rows.tolist(), pose @ session.rig_from_cam(rows), strict=True):
             name = session.image_name(row)
-            number = query.images.index(name) if name in query.images else -1
-            matches = np.flatnonzero(found.camera == number)
-            cameras.append(_shown_image(session, row, world_from_cam, found, matches, found.pixels[matches]))
+            matches = query.correspondences.in_camera(query.images.index(name) if name in query.images else -1)
+            cameras.append(_shown(session, row, pose, query, matches, query.correspondences.pixels[matches]))
         cameras.sort(key=lambda camera: -camera.num_inliers)
-        return QueryDetails(
-            cameras,
-            self._references(query, list(enumerate(query.references))),
-            self._references(query, [(-1, name) for name in query.rejected]),
-        )
+        used = {name: number for number, name in enumerate(query.references)}
+        rejected = self._references(query, dict.fromkeys(query.rejected, -1))
+        return QueryDetails(cameras, self._references(query, used), rejected)
 
-    def _references(self, query: QueryResult, names: Sequence[tuple[int, str]]) -> list[ShownImage]:
-        """Return the first few map images with their correspondences; `names` are (reference number, image name)."""
-        session, correspondences = self.map_session, query.correspondences
-        numbered_rows = [(number, session.row_of_name[name]) for number, name in names if name in session.row_of_name]
-        poses = session.world_from_cam([row for _, row in numbered_rows[:REFERENCES]])
-        images = []
-        for (number, row), pose in zip(numbered_rows, poses, strict=False):
-            views = np.flatnonzero(correspondences.view_reference == number)
-            matches, pixels = correspondences.view_of[views], correspondences.view_pixels[views]
-            images.append(_shown_image(session, row, pose, correspondences, matches, pixels))
+    def _references(self, query: QueryResult, numbers: Mapping[str, int]) -> list[ShownImage]:
+        """Return the first few map images with their correspondences; `numbers` are those of references by name."""
+        session, matches, images = self.map_session, query.correspondences, []
+        for name in [name for name in numbers if name in session.row_of_name][:REFERENCES]:
+            row, views = session.row_of_name[name], np.flatnonzero(matches.view_reference == numbers[name])
+            pose = session.world_from_cam([row])[0]
+            images.append(_shown(session, row, pose, query, matches.view_of[views], matches.view_pixels[views]))
         return images
 
 
-def _shown_image(
-    session: Session, row: int, pose: Floats, correspondences: Correspondences, matches: Ints, pixels: Floats
+def _shown(
+    session: Session, row: int, pose: Floats, query: QueryResult, matches: Ints, pixels: Floats
 ) -> ShownImage:
+    found, sensor = query.correspondences, str(session.images["sensor_id"].iloc[row])
     return ShownImage(
-        session.image_name(row),
-        session.image_path(row),
-        session.cameras([row])[0],
-        pose,
-        pixels,
-        correspondences.points[matches],
-        matches,
-        correspondences.inlier[matches],
+        *(session.image_name(row), session.image_path(row), session.camera(sensor), pose, pixels),
+        *(found.points[matches], matches, found.inlier[matches]),
         session.world_from_cam([row], ground_truth=True)[0],
-        correspondences.found_by[matches],
+        found.found_by[matches],
     )

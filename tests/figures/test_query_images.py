@@ -7,10 +7,11 @@ from PIL import Image
 
 from tests.displayed import picture_of
 from toolkit.capture.world_up import up_of_cameras
-from toolkit.figures.stills import WorstQuery, draw_localization, draw_scene, draw_worst
+from toolkit.figures.query_images import WorstQuery, draw_localization, draw_worst
 from toolkit.figures.style import error_colors, new_figure, save_figure
+from toolkit.figures.top_view import draw_scene
 from toolkit.geometry import make_pose, project
-from toolkit.results.images import QueryDetails, ShownImage
+from toolkit.results.localized import QueryDetails, ShownImage
 
 CAMERA = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[50, 50, 32, 24])
 HIGH = pycolmap.Camera(model="PINHOLE", width=64, height=96, params=[50, 50, 32, 48])

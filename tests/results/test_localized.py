@@ -9,13 +9,13 @@ import pytest
 from tests.localized import instants, some_correspondences, stored, write_pair, write_queries
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError
-from toolkit.figures.stills import draw_localization
+from toolkit.figures.query_images import draw_localization
 from toolkit.files import write_sidecar
 from toolkit.geometry import make_pose
 from toolkit.mapping.local_map import LocalMap
-from toolkit.results import images
+from toolkit.results import localized as images
 from toolkit.results import pair as localized
-from toolkit.results.images import LocalizedPair, sure_points
+from toolkit.results.localized import LocalizedPair, sure_points
 from toolkit.results.pair import load_maps, map_files
 
 INLIERS = [True, False, True, True, False, True]
@@ -98,8 +98,8 @@ def test_errors_are_those_of_the_device_as_in_the_evaluation(capture, open_pair)
     turn = make_pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.zeros(3))
     vars(pair.results)["poses"] = pair.results.poses @ turn
     shown = pair.localizations
-    assert shown.table["rotation_error_deg"].item() == pytest.approx(90)
-    assert shown.table["translation_error_m"].item() == pytest.approx(0, abs=1e-9)
+    assert shown.errors["rotation_error_deg"].item() == pytest.approx(90)
+    assert shown.errors["translation_error_m"].item() == pytest.approx(0, abs=1e-9)
     assert np.linalg.norm((shown.estimated - shown.true)[0, :3, 3]) > 0.01, "the camera stands beside the rig's center"
 
 
