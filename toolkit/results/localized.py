@@ -199,8 +199,9 @@ class LocalizedPair:
         found, cameras = query.correspondences, []
         for row, world_from_cam in zip(rows.tolist(), pose @ session.rig_from_cam(rows), strict=True):
             name = session.image_name(row)
-            matches = query.correspondences.in_camera(query.images.index(name) if name in query.images else -1)
-            cameras.append(_shown(session, row, pose, query, matches, query.correspondences.pixels[matches]))
+            number = query.images.index(name) if name in query.images else -1
+            matches = np.flatnonzero(found.camera == number)
+            cameras.append(_shown(session, row, world_from_cam, query, matches, found.pixels[matches]))
         cameras.sort(key=lambda camera: -camera.num_inliers)
         used = {name: number for number, name in enumerate(query.references)}
         rejected = self._references(query, dict.fromkeys(query.rejected, -1))
