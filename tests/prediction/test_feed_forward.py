@@ -21,7 +21,7 @@ from toolkit.figures.prediction import draw_prediction
 from toolkit.figures.style import save_figure
 from toolkit.files import SceneFiles
 from toolkit.localize import COLUMNS, PREDICTION_COLUMNS
-from toolkit.pose.base import QueryInput, References, View
+from toolkit.pose.base import Query, QueryInput, References, View
 from toolkit.pose.result import QueryResult
 from toolkit.prediction.feed_forward import (
     MAX_DEPTH_POINTS,
@@ -203,7 +203,10 @@ def test_a_rig_knows_better_than_its_cameras(world: World) -> None:
         queries, true = world.queries("spot")
         together += errors(answers_of(localizer, queries), true)[1].tolist()
         for camera in range(len(queries[0][0].views)):
-            single = [(query.part([camera]), [references[camera]]) for query, references in queries]
+            single = [
+                (Query([query.views[camera]], query.rig_from_cams[camera][None]), [references[camera]])
+                for query, references in queries
+            ]
             alone += errors(answers_of(localizer, single), true)[1].tolist()
     assert np.median(together) < 0.9 * np.median(alone)
 
