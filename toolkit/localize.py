@@ -382,7 +382,8 @@ class _Pair:
                 todo = [
                     one
                     for one in items.left(retried)
-                    if self.map.needs_fallback(*self.query(one[2]), self._first(items, one))
+                    if self.map.is_unsure(first := self._first(items, one))
+                    and self.map.needs_fallback(*self.query(one[2]), first)
                 ]
                 if todo:
                     started = time.perf_counter()

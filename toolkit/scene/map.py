@@ -291,15 +291,20 @@ class Map:
                   for part in (queries, following))  # fmt: skip
         return self.localizer.predict(*inputs)
 
-    def needs_fallback(self, query: Query, references: Sequence[References], result: QueryResult) -> bool:
-        """Tell whether a result is not sure, and fallback features might find a better pose."""
+    def is_unsure(self, result: QueryResult) -> bool:
+        """Tell whether fallback features, if there are any, might find a better pose."""
         if self.fallback is None or result.misfit:  # no features repair wrong intrinsics
             return False
         limit = MAX_SURE_STD_M * (1.0 if self.settings.unit else self.length)
         # A pose without matches has no deviation (NaN) and counts as precise.
-        sure = result.status is Status.OK and not result.position_std_m > limit
+        return result.status is not Status.OK or result.position_std_m > limit
+
+    def needs_fallback(self, query: Query, references: Sequence[References], result: QueryResult) -> bool:
+        """Tell whether a result is not sure, and the query has what fallback features need."""
         readable = zip(query.features, references, strict=True)
-        return not sure and any(not isinstance(each, str) and len(found.images) for each, found in readable)
+        return self.is_unsure(result) and any(
+            not isinstance(features, str) and len(found.images) for features, found in readable
+        )
 
     @fixed_sums
     def retry(
