@@ -164,7 +164,7 @@ def cases() -> Iterator[Any]:
             yield pytest.param(artifact, how, marks=() if quick else pytest.mark.slow)
 
 
-@pytest.mark.parametrize(("artifact", "how"), cases())
+@pytest.mark.parametrize(("artifact", "how"), list(cases()))
 def test_a_damaged_artifact_is_made_again_as_it_was(
     capture: Path,
     finished: SceneFiles,
