@@ -21,7 +21,7 @@ from toolkit.files import sidecar_path
 from toolkit.manifest import RetrieveSettings
 
 DIM = 64
-FACTORIES = ["RaBitQ", "IVF16,Flat", "PCA32,IVF16,RaBitQ", "HNSW16", "IVF2,PQ16", "PCA32,Flat"]
+FACTORIES = ["RaBitQ", "IVF16,Flat", "PCA32,IVF16,RaBitQ", "HNSW16", "IVF2,PQ16x4", "PCA32,Flat"]
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_rows_that_are_not_allowed_are_not_found(place: Path, tmp_path: Path, fa
         assert (scores == expected).mean() > 0.8
 
 
-@pytest.mark.parametrize("factory", ["IVF16,Flat", "IVF2,PQ16"])
+@pytest.mark.parametrize("factory", ["IVF16,Flat", "IVF2,PQ16x4"])
 def test_each_query_finds_what_it_may(place: Path, tmp_path: Path, factory: str) -> None:
     vectors = stored(place)
     settings = RetrieveSettings(index=factory, index_candidates=200, nprobe=16)

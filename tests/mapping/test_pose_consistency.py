@@ -127,7 +127,9 @@ def noisy(rotation_deg: float, position_m: float, seed: int) -> Change:
     return change
 
 
-@pytest.mark.parametrize(("rotation_deg", "position_m"), [(0.3, 0.0), (0.3, 0.02), (1.0, 0.02), (0.0, 0.03)])
+@pytest.mark.parametrize(("rotation_deg", "position_m"), [
+    (0.3, 0.0), (0.3, 0.02), pytest.param(1.0, 0.02, marks=pytest.mark.slow), (0.0, 0.03),
+])  # fmt: skip
 def test_the_noise_of_the_poses_is_measured(
     small_capture: Path, small_features: Path, rotation_deg: float, position_m: float
 ) -> None:
