@@ -31,7 +31,7 @@ def test_a_run_has_its_settings_maps_and_queries(small_run: Path, released_weigh
     folder = run.map(device).capture[f"{row['query_device']}_query"].path / "raw_data"
     assert {view.image for view in query.views} == {folder / image for image in (name, *others)}
     assert run.map(device).locate(query).status == row["status"].partition(":")[0]
-    with pytest.raises(ArtifactError, match=r"0 query images with the name 'nowhere.jpg'"):
+    with pytest.raises(ArtifactError, match=r"no query has an image 'nowhere.jpg'"):
         run["nowhere.jpg"]
 
 

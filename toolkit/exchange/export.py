@@ -38,7 +38,7 @@ from toolkit.files import (
 from toolkit.geometry import Floats, invert, pose_from_qt, qt_from_pose
 from toolkit.manifest import nearest
 from toolkit.mapping.local_map import LocalMap
-from toolkit.results.pair import PairResults
+from toolkit.results.pair import PairResults, names_of_maps
 
 NAMES = ("own", "capture")
 _LOCALIZE = "Run the localize stage first (python -m toolkit run MANIFEST --only localize)."
@@ -83,7 +83,7 @@ def export_colmap(
 def _maps_of(files: SceneFiles, device: str) -> list[Path]:
     """Return the files of the triangulated maps that a run localized with, one per kind of features."""
     for path in sorted(files.poses_dir.glob(f"{pair_name(files.scene, device, '*')}.h5")):
-        maps = [files.maps / name for name in PairResults(path.with_suffix(".txt"), pd.DataFrame()).maps]
+        maps = [files.maps / name for name in names_of_maps(path)]
         if maps:
             require_current(path.with_suffix(".txt"), "localize", (".npz",))
             return maps

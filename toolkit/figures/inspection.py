@@ -3,7 +3,6 @@
 Nothing here localizes, except `Inspection.again`.
 """
 
-import difflib
 import json
 import os
 import textwrap
@@ -27,6 +26,7 @@ from toolkit.manifest import LocalizeSettings, nearest
 from toolkit.pose.result import QueryResult
 from toolkit.results.localized import LocalizedPair
 from toolkit.results.metrics import worst_first
+from toolkit.results.pair import find_query
 from toolkit.runs.kernel import TEXT_BARS
 from toolkit.scene.map import WITHOUT_FEATURES, Map
 from toolkit.scene.opening import RETRIEVAL, SESSIONS_ROOT, how_localized
@@ -268,34 +268,6 @@ def inspect_query(run: str | Path, scene: str, map: str, query: str, n: int | st
 
 
 # One of many queries in a notebook
-
-
-def find_query(query: object, images: Mapping[str, int], count: int) -> int:
-    """Return the number of a query.
-
-    Args:
-        query: its number, the name of one of its images, or a unique end of the name.
-        images: number of the query by the name of each image.
-        count: number of queries.
-
-    Raises:
-        ArtifactError: no query matches, or several do; names the nearest.
-    """
-    if isinstance(query, int | np.integer) and not isinstance(query, bool):
-        if 0 <= query < count:
-            return int(query)
-        raise ArtifactError(f"query: found {query}, expected a number from 0 to {count - 1}, or the name of an image.")
-    if not isinstance(query, str | Path):
-        raise ArtifactError(f"query: found {query!r}, expected a number or the name of an image.")
-    name = image_name(str(query))
-    numbers = {images[name]} if name in images else {images[image] for image in images if image.endswith(f"/{name}")}
-    if len(numbers) == 1:
-        return numbers.pop()
-    if numbers:
-        raise ArtifactError(f"query: {len(numbers)} queries have an image name that ends in {name!r}; give more of it.")
-    close = difflib.get_close_matches(name, images, n=1, cutoff=0.0)
-    hint = f"The nearest of its {len(images)} images is {close[0]!r}." if close else "The pair has no queries."
-    raise ArtifactError(f"query: no query of the pair has an image {str(query)!r}. {hint}")
 
 
 @dataclass

@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from toolkit.capture import Capture, Session
 from toolkit.embedders import open_descriptors
 from toolkit.errors import ArtifactError
-from toolkit.figures.inspection import find_query
 from toolkit.figures.query_images import draw_image, query_and_references, shown_name
 from toolkit.figures.style import BLUE, GRAY, GREEN, MAP, ORANGE, TRUE, new_figure, shared_legend, shown, styled
 from toolkit.figures.top_view import Ground, Layer, draw_layers, window_of
 from toolkit.files import image_name, pair_devices, read_references, require_current
 from toolkit.geometry import Floats, Ints
 from toolkit.results.metrics import MIN_OVERLAP, is_posed, overlap_of
-from toolkit.results.pair import load_maps, map_files
+from toolkit.results.pair import find_query, load_maps, map_files
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

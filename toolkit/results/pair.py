@@ -4,8 +4,9 @@ The group `<timestamp>/<device_id>` of a query in `poses/<pair>.h5` holds the ar
 exports and evaluations read this file, so they use exactly the correspondences of the localization.
 """
 
+import difflib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,6 +21,7 @@ from toolkit.capture import Trajectory
 from toolkit.capture.tables import read_query_table
 from toolkit.errors import ArtifactError, CaptureError, DamagedError, first_line
 from toolkit.files import (
+    image_name,
     map_record_path,
     of_sequence,
     pair_devices,
@@ -118,20 +120,12 @@ class PairResults:
 
     @cached_property
     def _file(self) -> h5py.File:
-        try:
-            return h5py.File(self.h5, "r")
-        except HDF5_ERRORS as error:
-            raise ArtifactError(
-                f"{self.h5}: the correspondences of the poses cannot be read ({error}). Localize again."
-            ) from None
+        return _open(self.h5)
 
     @cached_property
     def maps(self) -> list[str]:
         """Names of the triangulated maps that `Correspondences.point_index` counts through."""
-        try:
-            return list(json.loads(self._file.attrs.get(MAPS, "[]")))
-        except HDF5_ERRORS as error:
-            raise ArtifactError(f"{self.h5}: its maps cannot be read ({error}). Localize again.") from None
+        return names_of_maps(self.h5)
 
     def local_map(self, map_dir: str | Path | None) -> LocalMap | None:
         """Return the triangulated maps of these poses pooled into one; None if none of them can be read."""
@@ -188,6 +182,28 @@ class PairResults:
         require_current(self.path, "localize", endings, missing=False)
 
 
+def _open(h5: Path) -> h5py.File:
+    try:
+        return h5py.File(h5, "r")
+    except HDF5_ERRORS as error:
+        raise ArtifactError(
+            f"{h5}: the correspondences of the poses cannot be read ({error}). Localize again."
+        ) from None
+
+
+def names_of_maps(h5: Path) -> list[str]:
+    """Return the names of the triangulated maps that a pair was localized in, from the file of its correspondences.
+
+    Raises:
+        ArtifactError: the file is missing or damaged.
+    """
+    try:
+        with _open(h5) as file:
+            return list(json.loads(file.attrs.get(MAPS, "[]")))
+    except HDF5_ERRORS as error:
+        raise ArtifactError(f"{h5}: its maps cannot be read ({error}). Localize again.") from None
+
+
 def map_files(map_dir: str | Path | None, session_id: str, h5: Path | None = None) -> tuple[Path, ...]:
     """Return the existing triangulated maps of a session, one per kind of features.
 
@@ -199,7 +215,7 @@ def map_files(map_dir: str | Path | None, session_id: str, h5: Path | None = Non
     """
     if map_dir is None:
         return ()
-    names = PairResults(h5, pd.DataFrame()).maps if h5 is not None and h5.is_file() else []
+    names = names_of_maps(h5) if h5 is not None and h5.is_file() else []
     paths = [Path(map_dir) / name for name in names] or sorted(Path(map_dir).glob(f"{session_id}*.npz"))
     return tuple(path for path in paths if path.is_file())
 
@@ -217,3 +233,31 @@ def pairs_of(poses_dir: str | Path) -> list[Path]:
     """Return the tables of all pairs in a folder of poses, `<pair>.csv`."""
     tables = sorted(Path(poses_dir).glob("*_map_*_query_*.csv"))
     return [path for path in tables if all(pair_devices(path.stem)) and not of_sequence(path.stem)]
+
+
+def find_query(query: object, images: Mapping[str, int], count: int) -> int:
+    """Return the number of a query.
+
+    Args:
+        query: its number, the name of one of its images, or a unique end of the name.
+        images: number of the query by the name of each image.
+        count: number of queries.
+
+    Raises:
+        ArtifactError: no query matches, or several do; names the nearest.
+    """
+    if isinstance(query, int | np.integer) and not isinstance(query, bool):
+        if 0 <= query < count:
+            return int(query)
+        raise ArtifactError(f"query: found {query}, expected a number from 0 to {count - 1}, or the name of an image.")
+    if not isinstance(query, str | Path):
+        raise ArtifactError(f"query: found {query!r}, expected a number or the name of an image.")
+    name = image_name(str(query))
+    numbers = {images[name]} if name in images else {images[image] for image in images if image.endswith(f"/{name}")}
+    if len(numbers) == 1:
+        return numbers.pop()
+    if numbers:
+        raise ArtifactError(f"query: {len(numbers)} queries have an image name that ends in {name!r}; give more of it.")
+    close = difflib.get_close_matches(name, images, n=1, cutoff=0.0)
+    hint = f"The nearest of its {len(images)} images is {close[0]!r}." if close else "There are no queries."
+    raise ArtifactError(f"query: no query has an image {str(query)!r}. {hint}")

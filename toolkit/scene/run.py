@@ -1,6 +1,5 @@
 """A run in the hand: what a manifest made."""
 
-import difflib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -8,13 +7,15 @@ from typing import Any
 
 import pandas as pd
 
+from toolkit.capture import Capture, Session
 from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles, pair_devices, read_json
+from toolkit.geometry import Ints
 from toolkit.pose.base import Query
-from toolkit.results.pair import PairResults, pairs_of
+from toolkit.results.pair import PairResults, find_query, pairs_of
 from toolkit.runs.folder import RECORD
 from toolkit.scene.map import Map
-from toolkit.scene.opening import localized_scenes, no_such_run
+from toolkit.scene.opening import SESSIONS_ROOT, how_localized, localized_scenes, no_such_run
 
 
 @dataclass(frozen=True)
@@ -87,21 +88,16 @@ class Run:
         Raises:
             ArtifactError: no query image has this name, or several do; names the nearest.
         """
-        images: dict[str, tuple[Map, str]] = {}
+        queries, images = list[tuple[str, str, Session, Ints]](), dict[str, int]()
         for scene in self.scenes:
-            pairs = [pair_devices(path.stem) for path in pairs_of(SceneFiles(self.path, scene).poses_dir)]
-            scene_map = self.map(pairs[0][0], scene)
-            for device in dict.fromkeys(query_device for _, query_device in pairs):
-                session = scene_map.capture[f"{device}_query"]
-                images |= dict.fromkeys(session.image_names, (scene_map, session.id))
-        found = [image for image in images if image == name or image.endswith(f"/{name}")]
-        if len(found) != 1:
-            close = found or difflib.get_close_matches(name, images, n=3, cutoff=0.0)
-            raise ArtifactError(
-                f"{self.path}: found {len(found)} query images with the name {name!r}, expected one. Near: {close[:3]}."
-            )
-        scene_map, session_id = images[found[0]]
-        session = scene_map.capture[session_id]
-        keyframes = session.rows_of_keyframes(session.keyframes("all"))
-        row = session.row_of_name[found[0]]
-        return scene_map.query_of_session(session, next(rows for rows in keyframes if row in rows))
+            pairs = pairs_of(SceneFiles(self.path, scene).poses_dir)
+            of_device = {pair_devices(path.stem)[1]: path for path in pairs}  # any pair with these queries
+            for device, path in of_device.items():
+                attributes = how_localized(path.with_suffix(".h5"))[1]
+                session = Capture.from_sessions_root(attributes[SESSIONS_ROOT])[f"{device}_query"]
+                map_device = pair_devices(path.stem)[0]
+                for rows in session.rows_of_keyframes(session.keyframes("all")):
+                    images |= dict.fromkeys((session.image_name(int(row)) for row in rows), len(queries))
+                    queries.append((scene, map_device, session, rows))
+        scene, map_device, session, rows = queries[find_query(name, images, len(queries))]
+        return self.map(map_device, scene).query_of_session(session, rows)
