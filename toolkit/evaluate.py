@@ -307,7 +307,7 @@ def _read_results(path: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
         require_whole(table, of=path)
         if not table.is_file():  # another tool writes only poses; then every pose counts as ok
             return results, "evaluated"
-        details = keys.merge(PairResults.open(path).table.drop_duplicates(_KEY), how="left", on=_KEY)
+        details = keys.merge(PairResults.open(path, whole=False).table.drop_duplicates(_KEY), how="left", on=_KEY)
     except ArtifactError as error:
         return results, f"unreadable table of queries ({error})"
     results = results.assign(**{name: details[name].astype(float) for name in DETAILS if name in details})
