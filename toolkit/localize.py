@@ -204,6 +204,7 @@ class _Stage(Remade):
             device, self.capture.path / "sessions", self.folders.map, self.settings, self.kinds, (), self.escalation,
             self.folders.features, predictor=self.predictor,
         )  # fmt: skip
+        scene_map.capture = self.capture  # its sessions are read already
         return scene_map.build(self.workers, self.skip_existing)
 
     @property

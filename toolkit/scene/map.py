@@ -106,8 +106,8 @@ class Map:
 
     def build(self, workers: int = 1, skip_existing: bool = True) -> "Map":
         """Extract features of the map session and triangulate points, or load them; return the map with them."""
-        mapped, settings = list[MappedFeatures](), self.settings
-        built = replace(self, mapped=mapped)
+        mapped, settings, built = list[MappedFeatures](), self.settings, copy.copy(self)
+        built.mapped = mapped
         session = built.session
         for kind in self.kinds if settings.map is not None else ():
             assert settings.map is not None
