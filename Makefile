@@ -4,6 +4,7 @@ VENV := .venv
 RUN_MANIFEST ?= data_manifests/demo.yaml
 # For torch without CUDA: PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu".
 PIP_ARGS ?=
+LAB_ARGS ?=
 INSTALLED := $(VENV)/.installed
 BIN := $(VENV)/bin
 # A worker needs up to 2 GB (slow tests: 6). Tests of a module stay in one worker because they share slow fixtures.
@@ -70,13 +71,14 @@ docs-images: $(INSTALLED)  ## draw the documentation's pictures from a demo run;
 docs-view: $(INSTALLED)  ## draw the documentation's picture of the localization view; needs mesa-vulkan-drivers
 	$(BIN)/python -m docs.view_image
 
-# Your changes to a copy stay: a newer notebook replaces it only if you have not changed it.
-lab: $(INSTALLED)  ## open JupyterLab on your own copies of the notebooks, in lab/
+# Your changes to a copy stay: a newer notebook replaces it only if you have not changed it. The page shows the whole
+# project, so that links from a notebook to a run's report and recordings work.
+lab: $(INSTALLED)  ## open JupyterLab on your own copies of the notebooks, in lab/; LAB_ARGS="--port 9999" or others
 	@mkdir -p lab/.from; for new in notebooks/*.ipynb; do name=$${new##*/}; \
 	if [ ! -e lab/$$name ] || cmp -s lab/$$name lab/.from/$$name; then cp $$new lab/$$name; cp $$new lab/.from/$$name; \
 	elif ! cmp -s $$new lab/.from/$$name; then \
 	  echo "$$new is newer than lab/$$name, which you have changed: delete yours to take it."; fi; done
-	$(BIN)/python -m jupyterlab --config=notebooks/lab_config.py --notebook-dir lab
+	$(BIN)/python -m jupyterlab --config=notebooks/lab_config.py --notebook-dir . $(LAB_ARGS) lab/start.ipynb
 
 lint: $(INSTALLED)  ## run ruff and mypy
 	$(BIN)/python -m ruff check .

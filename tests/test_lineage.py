@@ -17,7 +17,6 @@ from toolkit.errors import ArtifactError, ManifestError
 from toolkit.evaluate import evaluate_scene
 from toolkit.exchange.export import export_colmap, export_pairs, export_poses
 from toolkit.exchange.submission import collect
-from toolkit.figures.inspection import inspect_query
 from toolkit.figures.retrieval import RetrievedPair
 from toolkit.files import (
     SceneFiles,
@@ -33,6 +32,7 @@ from toolkit.files import (
 from toolkit.notebook import notebook_path
 from toolkit.report.comparison import compare_runs
 from toolkit.report.page import write_report
+from toolkit.scene.inspection import inspect_query
 from toolkit.scene.map import Map
 from toolkit.visualize import visualize_scene
 
@@ -131,7 +131,7 @@ def compared(files: SceneFiles, capture: Path) -> str:
 
 
 def inspected_again(files: SceneFiles, capture: Path) -> str:
-    return str(inspect_query(files.run, files.scene, "ios", "hl").again({}))
+    return str(inspect_query(files.run, files.scene, "ios", "hl").result.what_if())
 
 
 def inspected(files: SceneFiles, capture: Path) -> str:

@@ -37,12 +37,11 @@ from toolkit.features.features import KINDS, LocalFeatures
 from toolkit.features.matching import MATCHERS, LocalMethod, MutualMatcher, unit_descriptors
 from toolkit.features.sift import SiftExtractor, SiftSettings
 from toolkit.features.stores import extract_session
-from toolkit.figures.inspection import InspectedPair
 from toolkit.files import SceneFiles, image_name, map_record_path, read_map_record, read_references, sidecar_path
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
 from toolkit.manifest import EmbedSettings, LocalizeSettings
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.base import Localizer, Prior, Query, QueryMatches, RoughPose, View
+from toolkit.pose.base import Localizer, Prior, Query, QueryMatches, References, RoughPose, View
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer
 from toolkit.pose.result import QueryResult, Status
@@ -54,6 +53,7 @@ from toolkit.results.pair import PairResults
 from toolkit.retrieve import load_embeddings, retrieve_pairs
 from toolkit.scene import map as maps
 from toolkit.scene import search
+from toolkit.scene.inspection import InspectedPair
 from toolkit.scene.query import pixels_from
 from toolkit.sequence import sequence_pairs
 
@@ -841,11 +841,15 @@ def test_a_run_with_a_torn_file_of_correspondences_says_so(
         Map.open(run.run, run.scene, "ios")
 
 
-def test_a_map_without_points_is_refused(small_capture: Path, run: SceneFiles) -> None:
+def test_a_map_without_points_gets_them_for_a_query(small_capture: Path, run: SceneFiles) -> None:
+    """It was refused: a run with `nearest` has no features and no points."""
     run_stage(small_capture, run, query_device="ios", method="nearest")
     place = Map.open(run.run, run.scene, "ios")
-    with pytest.raises(ArtifactError, match=r"has no points.*'pnp'"):
-        _ = place.changed({"method": "pnp"}).localizer
+    session = place.capture["ios_query"]
+    query = place.query_of_session(session, session.camera_rows[:1])
+    references = [References.of(list(range(6)))]
+    assert place.locate(query, references=references).status == "low_confidence"
+    assert place.changed({"method": "pnp", "features": "sift"}).locate(query, references=references).status == "ok"
 
 
 def test_a_localizer_of_another_method_sees_images_upright_as_its_settings_say(
@@ -1053,7 +1057,7 @@ def test_pictures_and_inspections_get_the_pose_of_the_run_byte_for_byte(
         text = ", ".join(repr(float(number)) for number in geometry.qt_from_pose(estimate.world_from_rig))
         assert text in line, f"{key.timestamp}"
         if number < 2:
-            again = pair.look(number).again().after
+            again = pair.look(number).result.what_if().after
             np.testing.assert_array_equal(again.result.world_from_rig, estimate.world_from_rig)
             assert (again.result.status, again.numbers["num_inliers"]) == (estimate.status, estimate.num_inliers)
         before = localized[number].correspondences

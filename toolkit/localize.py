@@ -47,10 +47,10 @@ from toolkit.pose.result import QueryResult, status_counts
 from toolkit.prediction.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.prediction.network import open_predictor
 from toolkit.results.metrics import camera_messages
+from toolkit.results.opening import MAPS, attributes, session_fingerprint, update_attributes
 from toolkit.results.pair import query_group
 from toolkit.runs.pairs import PairRows
 from toolkit.scene.map import WITHOUT_FEATURES, Map, create_methods, localize_image, needs_upright
-from toolkit.scene.opening import MAPS, attributes, session_fingerprint, update_attributes
 from toolkit.scene.stored import StoredQueries
 from toolkit.store.hdf5 import write_groups
 from toolkit.store.items import Items, heals

@@ -36,8 +36,8 @@ from toolkit.manifest import SequenceSettings
 from toolkit.pose.base import RoughPose
 from toolkit.pose.result import QueryResult, Status, status_counts, stds_of
 from toolkit.results.pair import PairResults
+from toolkit.scene.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
 from toolkit.scene.map import Map
-from toolkit.sequences.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
 from toolkit.sequences.odometry import (
     UNKNOWN_COVARIANCE,
     Odometry,

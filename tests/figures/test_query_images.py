@@ -121,7 +121,7 @@ def test_localization_pictures_of_success_and_failure(images):
     assert done.get_suptitle() == "query 7: ok · off by 0°, 2 cm"
     titles = ["query: 4 of 5 map points agree", *(f"reference {k}: sees 2 points" for k in (1, 2))]
     assert [axis.get_title() for axis in done.axes] == [*titles, "rejected: contradicts the others"]
-    lost = QueryDetails([ShownImage("q", query.path, CAMERA, np.full((4, 4), np.nan))])
+    lost = QueryDetails([ShownImage("q", query.image, CAMERA, np.full((4, 4), np.nan))])
     failed = draw_localization(lost, "query 8")
     assert failed.axes[0].get_title() == "query: not localized"
 
@@ -130,7 +130,7 @@ def test_the_worst_queries_are_drawn_with_the_matches_they_share_with_a_referenc
     query, reference = images
     imported = replace(query, name="hl_query/raw_data/import/images/7.jpg")
     gone = ShownImage("x", tmp_path / "gone.jpg", CAMERA, np.eye(4))
-    unmatched = ShownImage("q", query.path, CAMERA, np.eye(4))
+    unmatched = ShownImage("q", query.image, CAMERA, np.eye(4))
     worst = [
         WorstQuery("hl in the ios map", "failed: too few matches, 3 matches", QueryDetails([query])),
         WorstQuery("hl in the ios map", "ok, 5 matches", QueryDetails([imported], [reference]), 2.0, 0.5),

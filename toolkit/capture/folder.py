@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Iterable, Iterator, Sequence
+from html import escape
 from itertools import product
 from pathlib import Path
 
@@ -145,6 +146,10 @@ class Capture:
             except CaptureError as error:
                 log.warning("%s is not used: %s", name, error)
         return sessions
+
+    def _repr_html_(self) -> str:
+        rows = "".join(f"<li>{escape(repr(session))}</li>" for split in SPLITS for session in self.usable(split))
+        return f"<p><b>{escape(self.name)}</b>: {escape(str(self.path))}</p><ul>{rows}</ul>"
 
     def __contains__(self, session_id: object) -> bool:
         return session_id in self.session_ids

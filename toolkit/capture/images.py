@@ -3,6 +3,7 @@
 Also numbers of threads for loops over images, and a guess of intrinsics from EXIF.
 """
 
+import base64
 import os
 import stat
 from collections import deque
@@ -187,6 +188,21 @@ def read_for_display(path: str | Path, longest: int) -> NDArray[np.uint8]:
         blank = np.full((240, 320, 3), 200, np.uint8)
         cv2.putText(blank, "unreadable", (60, 130), cv2.FONT_HERSHEY_SIMPLEX, 1.1, (90, 90, 90), 2)
         return shrunk(blank, longest)
+
+
+def thumbnails(images: Iterable[Path | NDArray[np.uint8]], size: int = 110) -> str:
+    """Return `<img>` elements that contain small copies of images, files or pixels, in RGB.
+
+    Args:
+        size: longer side of a copy, pixels.
+    """
+    elements = []
+    for image in images:
+        small = read_for_display(image, size) if isinstance(image, Path) else shrunk(image, size)
+        _, data = cv2.imencode(".jpg", np.ascontiguousarray(small[..., ::-1]) if small.ndim == 3 else small)
+        text = base64.b64encode(data.tobytes()).decode()
+        elements.append(f"<img src='data:image/jpeg;base64,{text}' alt='' style='margin:2px'>")
+    return "".join(elements)
 
 
 def default_workers() -> int:

@@ -15,6 +15,7 @@ numbers), and no Python code loops over rows while a session is read.
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property, lru_cache
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,8 +26,9 @@ import pyarrow.compute as pc
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture import names
-from toolkit.capture.cameras import parse_camera
+from toolkit.capture.cameras import camera_text, parse_camera
 from toolkit.capture.devices import session_id, session_of
+from toolkit.capture.images import thumbnails
 from toolkit.capture.tables import (
     ALIGNED,
     COLUMNS,
@@ -123,6 +125,17 @@ class Session:
     def __repr__(self) -> str:
         poses = 0 if self.ground_truth is None else len(self.ground_truth)
         return f"Session({self.id}: {len(self.images)} images, {len(self.sensors)} sensors, {poses} poses)"
+
+    def _repr_html_(self) -> str:
+        rows = self.camera_rows
+        sample = rows[np.unique(np.linspace(0, len(rows) - 1, min(6, len(rows))).astype(int))] if len(rows) else rows
+        cameras = [camera_text(self.camera(sensor)) for sensor in pd.unique(self.images["sensor_id"].iloc[rows])]
+        listed = "".join(f"<li>{escape(text)}</li>" for text in dict.fromkeys(cameras[:4]))
+        return (
+            f"<p><b>{escape(self.id)}</b>: {len(self)} images in {len(self.subsessions)} recordings, "
+            f"{len(pd.unique(self.device_ids))} devices. {escape(repr(self))}</p>"
+            f"{thumbnails(self.image_path(row) for row in sample.tolist())}<ul>{listed}</ul>"
+        )
 
     def __len__(self) -> int:
         return len(self.images)

@@ -2,22 +2,40 @@
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from toolkit.figures.query_images import PURPLE, draw_image, draw_joined, draw_matches, style_of
-from toolkit.figures.style import BLUE, ESTIMATED, GRAY, MAP, ORANGE, TRUE, new_figure, number, styled
+from toolkit.capture import Session
+from toolkit.capture.images import thumbnails
+from toolkit.figures.query_images import PURPLE, draw_image, draw_joined, draw_matches, shown_name, style_of
+from toolkit.figures.style import (
+    BLUE,
+    ESTIMATED,
+    GRAY,
+    GREEN,
+    MAP,
+    ORANGE,
+    TRUE,
+    VERMILLION,
+    new_figure,
+    number,
+    shown,
+    styled,
+)
 from toolkit.figures.top_view import Ground, Layer, Places, draw_layers, window_of
 from toolkit.geometry import Floats, shifted
 from toolkit.manifest import LocalizeSettings
+from toolkit.mapping.local_map import LocalMap
+from toolkit.pose.base import View
 from toolkit.pose.confidence import bounded_by_rivals
 from toolkit.pose.result import CAMERA, QueryResult, Status
-from toolkit.results.localized import LocalizedPair, QueryDetails, sure_points
+from toolkit.results.localized import QueryDetails, query_details, sure_points
 from toolkit.results.metrics import is_posed, pose_errors
 
 if TYPE_CHECKING:
@@ -40,6 +58,7 @@ OF_NETWORKS = {
 """Labels and formats that differ for poses of a feed-forward network."""
 OF_MATCHES = ("num_guided", "rmse_px", "coverage", "p_correct", "rival_support", "agreement")
 """Numbers that a pose without matches does not have."""
+STATUS_COLORS = {Status.OK: GREEN, Status.LOW_CONFIDENCE: ORANGE, Status.FAILED: VERMILLION}
 SURE = 2.4477
 """Radius of the 95 % region of a 2D normal distribution, standard deviations."""
 MAX_POINTS = 20_000
@@ -49,35 +68,46 @@ BELOW: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16), 
 """Legend below a panel."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Answer:
-    """How one query of a pair was localized."""
+    """How one query was localized in a map. A notebook displays its figure."""
 
-    pair: LocalizedPair
-    number: int
-    """Number of the query in the pair."""
     result: QueryResult
     settings: LocalizeSettings
     """Settings that it was localized with."""
+    views: Sequence[View]
+    """Images of the query."""
+    rig_from_cams: Floats
+    """(C, 4, 4)"""
+    map_session: Session
+    local_map: LocalMap | None
+    """The triangulated maps, pooled."""
+    unit: tuple[str, float] = ("m", 1.0)
+    """Unit that lengths are shown in, see `metrics.length_unit`."""
+    true_pose: Floats | None = None
+    """world_from_rig (4, 4); None if unknown."""
+    of: str = "query"
+    """What is localized, such as `query 3 of hl`."""
+    number: int | None = None
+    """Number of the query in its pair."""
     retrieved: dict[str, tuple[int, float]] = field(default_factory=dict)
     """Rank, from 1, and score of each retrieved reference, by name; for a rig, the best rank among its cameras."""
 
     @property
     def name(self) -> str:
         """Name of its first image."""
-        return str(self.pair.localizations.names[self.number])
+        return self.views[0].name
 
     @property
     def headline(self) -> str:
-        """Number, devices and status of the query."""
-        devices = f"{self.pair.query_session.device} in the map of {self.pair.map_session.device}"
-        return f"query {self.number} of {devices}: {self.result.status_text}"
+        """What was localized, in which map, and its status."""
+        return f"{self.of} in the map of {self.map_session.device}: {self.result.status_text}"
 
     @cached_property
     def numbers(self) -> dict[str, float]:
-        """The known ones of `LABELS`; lengths in the pair's unit."""
+        """The known ones of `LABELS`; lengths in `unit`."""
         numbers = {name: float(getattr(self.result, name)) for name in LABELS}
-        numbers["position_std_m"] /= self.pair.results.unit[1]
+        numbers["position_std_m"] /= self.unit[1]
         return {name: value for name, value in numbers.items() if np.isfinite(value)}
 
     @property
@@ -88,7 +118,7 @@ class Answer:
     @property
     def texts(self) -> dict[str, str]:
         """The known numbers, errors and seconds as texts by their label."""
-        by_network, unit, numbers = _is_by_network(self.result.found_by), self.pair.results.unit[0], self.numbers
+        by_network, unit, numbers = _is_by_network(self.result.found_by), self.unit[0], self.numbers
         hidden = set(OF_MATCHES) if by_network else set[str]()
         if self.result.world_from_rig is not None and not numbers.get("num_matches"):
             hidden = {*OF_MATCHES, *OF_NETWORKS}
@@ -106,29 +136,16 @@ class Answer:
     @cached_property
     def details(self) -> QueryDetails:
         """Its images and references, with their correspondences."""
-        return self.pair.details(self.number, self.result)
-
-    @property
-    def rig_from_cam(self) -> Floats:
-        """Pose of the first image of the `details`, (4, 4)."""
-        session, rows = self.pair.query_session, self.pair.rows[self.number]
-        names = [session.image_name(int(row)) for row in rows]
-        return np.asarray(session.rig_from_cam(rows)[names.index(self.details.cameras[0].name)])
-
-    @property
-    def true_pose(self) -> Floats | None:
-        """world_from_rig (4, 4); None if unknown."""
-        true = self.pair.true_poses[self.number]
-        return true if is_posed(true) else None
+        return query_details(self.result, self.views, self.rig_from_cams, self.map_session, self.true_pose)
 
     @property
     def error(self) -> tuple[float, float] | None:
-        """Rotation error, degrees, and position error in the pair's unit; None without a pose or ground truth."""
+        """Rotation error, degrees, and position error in `unit`; None without a pose or ground truth."""
         pose, true_pose = self.result.world_from_rig, self.true_pose
         if pose is None or true_pose is None:
             return None
         rotation_deg, translation = pose_errors(pose[None], true_pose[None])
-        return float(rotation_deg[0]), float(translation[0]) / self.pair.results.unit[1]
+        return float(rotation_deg[0]), float(translation[0]) / self.unit[1]
 
     @cached_property
     def matches(self) -> pd.DataFrame:
@@ -155,8 +172,62 @@ class Answer:
         table = pd.DataFrame(rows, columns=["name", "rank", "score", "used", "rejected", "shared"])
         return table.astype({"rank": "Int64", "shared": "Int64"})
 
+    @cached_property
+    def figure(self) -> "Figure":
+        title = f"{self.headline}\n{shown_name(self.name, 110)}\n{textwrap.fill(self.reason, 130)}"
+        return draw_answers([self], title)
+
+    @property
+    def html(self) -> str:
+        """Status and reason in words, the pose, the main numbers and a small picture, as HTML."""
+        result, rows = self.result, self.texts
+        if result.world_from_rig is not None:
+            position = ", ".join(f"{x:.3f}" for x in result.world_from_rig[:3, 3])
+            rows = {f"position [{'m' if self.unit[0] == 'm' else 'unit of the map'}]": position, **rows}
+        cells = "".join(f"<tr><td>{escape(label)}</td><td>{escape(text)}</td></tr>" for label, text in rows.items())
+        name = shown_name(self.name, 110)
+        name = name if isinstance(self.views[0].image, np.ndarray) or "/" in self.name else self.views[0].image.name
+        return (
+            f"<div style='display:flex;gap:1em;align-items:flex-start'>{thumbnails([self.views[0].image], 200)}<div>"
+            f"<b style='color:{STATUS_COLORS[result.status]}'>{escape(result.status_text)}</b> {escape(name)}"
+            f"<p>{escape(self.reason)}</p><table>{cells}</table></div></div>"
+        )
+
     def __repr__(self) -> str:
         return f"{self.headline}\n{self.name}\n{self.reason}"
+
+    def _repr_mimebundle_(self, **_: Any) -> dict[str, bytes]:
+        return shown(self.figure)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One query localized twice. A notebook displays its figure."""
+
+    before: Answer
+    after: Answer
+    changes: dict[str, Any]
+    """What was changed."""
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """Status, method, numbers, errors and seconds as texts; columns before and after."""
+        both = {"before": self.before, "after": self.after}
+        texts = {name: {"status": one.result.status_text, **one.texts} for name, one in both.items()}
+        return pd.DataFrame(texts, dtype=object)
+
+    @cached_property
+    def figure(self) -> "Figure":
+        """Both answers side by side."""
+        changed = ", ".join(f"{key}: {value}" for key, value in self.changes.items()) or "no setting changed"
+        first = self.before.headline.rpartition(":")[0]
+        return draw_answers([self.before, self.after], f"{first}, localized again\n{textwrap.fill(changed, 120)}")
+
+    def __repr__(self) -> str:
+        return f"{self.changes or 'nothing changed'}\nbefore: {self.before!r}\nafter: {self.after!r}"
+
+    def _repr_mimebundle_(self, **_: Any) -> dict[str, bytes]:
+        return shown(self.figure)
 
 
 # In words
@@ -295,15 +366,15 @@ def _draw_further(figure: "SubFigure", details: QueryDetails) -> None:
 
 def _ground_and_cameras(answer: Answer) -> tuple[Ground, Floats]:
     """Return the ground of the map, and the poses of its cameras (N, 4, 4)."""
-    poses = answer.pair.map_session.world_from_cam()
+    poses = answer.map_session.world_from_cam()
     poses = poses[is_posed(poses)]
-    return Ground.below(poses, answer.settings.world_up, answer.pair.results.unit), poses
+    return Ground.below(poses, answer.settings.world_up, answer.unit), poses
 
 
 def _cameras_of(answers: Sequence[Answer]) -> list[tuple[Floats, str, str]]:
     """Return world_from_cam, label and color of the answers with a pose, and of the ground truth if known."""
     # A rig is shown by the camera that the first answer draws.
-    rig_from_cam, true = answers[0].rig_from_cam, answers[0].true_pose
+    rig_from_cam, true = answers[0].details.rig_from_cam, answers[0].true_pose
     names = NAMES if len(answers) > 1 else ("estimated",)
     estimated = (answer.result.world_from_rig for answer in answers)
     poses = [*zip(estimated, names, COLORS, strict=False), (true, "true", TRUE)]
@@ -320,13 +391,13 @@ def _draw_from_above(axis: "Axes", answers: Sequence[Answer]) -> None:
     """Draw the place of the map around the query from above: map points, cameras, references, poses, rivals, truth."""
     answer = answers[0]
     ground, cameras = _ground_and_cameras(answer)
-    points = sure_points(answer.pair.local_map)[0]
+    points = sure_points(answer.local_map)[0]
     points = points[:: len(points) // MAX_POINTS + 1]
     references = np.array([image.world_from_cam for image in answer.details.references]).reshape(-1, 4, 4)
     references = references[is_posed(references)]
     shown, named = _cameras_of(answers), list[tuple[Floats, str, Layer]]()
     for rival in answers[-1].result.rivals:
-        pose, label = rival.world_from_rig @ answer.rig_from_cam, f"rival, {rival.support:.0%} of the support"
+        pose, label = rival.world_from_rig @ answer.details.rig_from_cam, f"rival, {rival.support:.0%} of the support"
         diamond = Layer(pose[None], label, BLUE, 0.08, hollow=True, s=40, marker="D")
         named.append((pose, f"rival ({rival.support:.0%})", diamond))
     named += [(pose, name, _dot(pose, name, color, 0.12)) for pose, name, color in shown]
@@ -363,14 +434,16 @@ def _draw_near(axis: "Axes", answers: Sequence[Answer]) -> None:
         axis.set_axis_off()
         axis.text(0.5, 0.5, "no pose", ha="center", va="center", color=GRAY)
         return
-    unit, length = posed[0].pair.results.unit
+    unit, length = posed[0].unit
     ground, shown = _ground_and_cameras(posed[0])[0], _cameras_of(answers)
     origin = -shown[0][0][:3, 3]
     shown = [(shifted(pose, origin), name, color) for pose, name, color in shown]
     ellipses, reach = [], [float(np.abs(ground.flat(pose)).max()) for pose, _, _ in shown]
     for of_answer, answer in zip(shown, posed, strict=False):  # the truth is shown last
-        if answer.result.covariance is not None:
-            spread = ground.axes @ _position_covariance(answer, answers[0].rig_from_cam) @ ground.axes.T
+        # The camera of a rig that the first answer draws is drawn of both.
+        details = replace(answer.details, rig_from_cam=answers[0].details.rig_from_cam)
+        if details.position_covariance is not None:
+            spread = ground.axes @ details.position_covariance @ ground.axes.T
             values, vectors = np.linalg.eigh(spread)
             sizes = 2 * SURE * np.sqrt(np.maximum(values, 0)) / length
             reach.append(float(sizes.max()) * 0.55)
@@ -387,19 +460,6 @@ def _draw_near(axis: "Axes", answers: Sequence[Answer]) -> None:
     axis.set_title(f"the pose, enlarged{'' if ellipses else ': the method states no uncertainty'}", fontsize=9)
     axis.grid(alpha=0.25)
     axis.legend(**BELOW)
-
-
-def _position_covariance(answer: Answer, rig_from_cam: Floats) -> Floats:
-    """Return the covariance (3, 3) of a camera's position in the world, square meters.
-
-    A small motion of the rig in its own frame, rotation w and translation t, moves a camera at c by t + w x c.
-    """
-    assert answer.result.world_from_rig is not None
-    assert answer.result.covariance is not None
-    x, y, z = rig_from_cam[:3, 3]
-    lever = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
-    moves = answer.result.world_from_rig[:3, :3] @ np.hstack([lever, np.eye(3)])
-    return np.asarray(moves @ answer.result.covariance @ moves.T)
 
 
 def _draw_table(axis: "Axes", answers: Sequence[Answer]) -> None:

@@ -27,6 +27,8 @@ MARKERS = {"": "o", "sift": "o", "aliked": "^", "superpoint": "s"}
 """Markers, by kind of features."""
 MAX_LINES = 60
 """Lines drawn for correspondences that agree, and for rejected ones: more would hide the images."""
+MAX_SHOWN = 8
+"""References of an image that `draw_references` draws."""
 MAX_LETTERS = 60
 """Letters of an image name on the sheet of the worst queries: more would run into the next image."""
 
@@ -73,7 +75,7 @@ def draw_image(
     if isinstance(image, ShownImage):
         height, ratio = image.camera.height if height is None else height, image.ratio
         extent, inches = (left, left + height * ratio, height, 0), inches * max(1.0, ratio)
-        image = image.path
+        image = image.image
     pixels = read_for_display(image, inches_to_pixels(inches)) if isinstance(image, Path) else image
     axis.imshow(pixels, cmap="gray", extent=extent, interpolation="antialiased")
     axis.set(xticks=[], yticks=[])
@@ -139,6 +141,41 @@ def draw_joined(axis: "Axes", query: QueryDetails, inches: float, by_kind: bool 
             colors = [style_of(kind, agrees)["color"] for kind in kinds]
             axis.add_collection(LineCollection(list(lines[chosen]), colors=colors, linewidths=0.6, alpha=0.7))
     axis.set(xlim=(0, end), ylim=(height, 0), aspect="equal")
+
+
+@styled
+def draw_pair(query: ShownImage, reference: ShownImage, title: str) -> "Figure":
+    """Draw a query image and a reference with lines between their matches."""
+    figure = new_figure(11, 4.2)
+    axis = figure.subplots()
+    draw_joined(axis, QueryDetails([query], [reference]), 3.6)
+    axis.set_axis_off()
+    axis.set_title(f"{title}\n{shown_name(query.name)}  |  {shown_name(reference.name)}", fontsize=9)
+    return figure
+
+
+@styled
+def draw_references(
+    images: Sequence[Path | NDArray[np.uint8]], references: Sequence[Sequence[tuple[Path, float]]]
+) -> "Figure":
+    """Draw the images of a query, one per row, each beside its references, with their ranks and scores.
+
+    Args:
+        images: files or pixels.
+        references: file and score of the references of each image, best first; at most `MAX_SHOWN` are drawn.
+    """
+    shown_rows = [found[:MAX_SHOWN] for found in references]
+    columns = max([len(found) for found in shown_rows], default=0)
+    figure = new_figure(13, 1.75 * len(images))
+    panels = figure.subplots(len(images), 1 + max(columns, 1), squeeze=False)
+    for axis in panels.flat:
+        axis.set_axis_off()
+    for row, image, found in zip(panels, images, shown_rows, strict=True):
+        row[0].set_axis_on()
+        draw_image(row[0], image, 2.0, "query", frame="black")
+        for rank, (axis, (file, score)) in enumerate(zip(row[1:], found, strict=False), start=1):
+            draw_image(axis, file, 2.0, f"{rank}: {score:.3g}")
+    return figure
 
 
 @styled

@@ -3,7 +3,7 @@
 import itertools
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -163,9 +163,17 @@ def _read_override(override: str) -> dict[str, Any]:
         value = _parse_yaml(text)
     except yaml.YAMLError as error:
         raise ManifestError(f"--set {override}: the value is not valid YAML. {error}") from None
-    for section in reversed(key.strip().split(".")):
-        value = {section: value}
-    return dict(value)
+    return nested({key.strip(): value})
+
+
+def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values by keys such as `localize.pnp.seed` as nested sections; values may be sections, too."""
+    sections: dict[str, Any] = {}
+    for key, value in values.items():
+        for name in reversed(str(key).split(".")):
+            value = {name: value}
+        sections = merge(sections, value)
+    return sections
 
 
 def _has(content: Any, keys: list[str]) -> bool:

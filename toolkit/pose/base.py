@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from toolkit import geometry
-from toolkit.capture.images import pixels_of, stored_size
+from toolkit.capture.cameras import camera_text
+from toolkit.capture.images import pixels_of, stored_size, thumbnails
 from toolkit.errors import CameraError
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned
 from toolkit.features.matching import AnyMethod, PairMatches
@@ -80,6 +82,10 @@ class Query:
     """Stored matches with references, by image and kind of features; empty if there are none."""
     descriptors: Sequence[NDArray[np.float32]] = ()
     """Global descriptors (C, D) of the images, by embedder of the map; empty if none were computed."""
+
+    def _repr_html_(self) -> str:
+        rows = "".join(f"<li>{escape(view.name)}: {escape(camera_text(view.camera))}</li>" for view in self.views)
+        return f"{thumbnails((view.image for view in self.views), 240)}<ul>{rows}</ul>"
 
     def scaled(self, factor: float) -> "Query":
         """Return the query with the baselines of its rig multiplied by a factor."""

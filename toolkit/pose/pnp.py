@@ -101,6 +101,12 @@ class PnpMatches(QueryMatches):
             [features for features in self.query.features if not isinstance(features, str)],
         )
 
+    def _repr_html_(self) -> str:
+        found = self.with_references([self.references[index] for index in self.usable])
+        per_image = np.bincount(found.camera, minlength=len(self.usable)).tolist()
+        counts = ", ".join(f"{count} in image {index}" for index, count in zip(self.usable, per_image, strict=True))
+        return f"<p>{len(found)} matches with map points by descriptors: {counts or 'no image has features'}.</p>"
+
     def with_references(self, references: Sequence[References]) -> Matches:
         """Return the matches of each usable image with some of its references."""
         stored = [self.query.network_matches[index] for index in self.usable] if self.query.network_matches else []

@@ -1,16 +1,17 @@
 """The result of localizing one query: status and reason, pose, evidence, references, and correspondences."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Any, NamedTuple, Self
+from html import escape
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from toolkit import geometry
-from toolkit.errors import INTERNAL
+from toolkit.errors import INTERNAL, ArtifactError
 from toolkit.geometry import Floats, Ints
 
 CAMERA = "camera?"
@@ -85,6 +86,16 @@ class Correspondences:
         return len(self.camera)
 
 
+class Context(Protocol):
+    """A query in its map, which its results need to show themselves."""
+
+    @property
+    def answer(self) -> "Callable[[QueryResult], Any]": ...
+    def show_3d(self, results: Sequence["QueryResult"], rays: bool) -> Any: ...
+    @property
+    def what_if(self) -> Callable[..., Any]: ...
+
+
 _STORED: dict[str, tuple[type[np.generic], tuple[int, ...]]] = {
     "camera": (np.int32, ()),
     "pixels": (np.float32, (2,)),
@@ -99,7 +110,7 @@ _STORED: dict[str, tuple[type[np.generic], tuple[int, ...]]] = {
 keeps pixels of any image exact to a hundredth."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class QueryResult:
     """How one query was localized: its pose and how far to trust it, or why it has none."""
 
@@ -159,6 +170,43 @@ class QueryResult:
     """If fallback features were used: status and reason from the other features alone."""
     first_seconds: float | None = None
     """Time that the pose from the other features took."""
+    context: Context | None = field(default=None, repr=False, compare=False)
+    """The query in its map; None for a result that a `Map` or `Run` did not return."""
+
+    def show(self) -> Any:
+        """Return status and reason in words, numbers, matches, references and positions; a notebook shows a figure.
+
+        Raises:
+            ArtifactError: the result is not of a `Map` or `Run`.
+        """
+        return self._in_map.answer(self)
+
+    def show_3d(self, *others: "QueryResult", rays: bool = False) -> Any:
+        """Return this result and others in the map in 3D: cameras, uncertainty, rivals, references and map points.
+
+        In a live notebook, it is shown by the rerun viewer; a saved notebook keeps a picture.
+
+        Args:
+            others: further results in the same map.
+            rays: draw a ray from the camera through each inlier to its map point.
+
+        Raises:
+            ArtifactError: the result is not of a `Map` or `Run`.
+        """
+        return self._in_map.show_3d([self, *others], rays)
+
+    def what_if(self, changes: Mapping[str, Any] | None = None, **more: Any) -> Any:
+        """Localize the query again with something changed; see `scene.located.Located.what_if`."""
+        return self._in_map.what_if(self, changes or {}, **more)
+
+    @property
+    def _in_map(self) -> Context:
+        if self.context is None:
+            raise ArtifactError("This result belongs to no map. To get one that does: Map.locate, or Run.result.")
+        return self.context
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(self.status_text)}</p>" if self.context is None else str(self.context.answer(self).html)
 
     @classmethod
     def failed(cls, reason: str, **known: Any) -> Self:
@@ -186,6 +234,12 @@ class QueryResult:
     def is_internal(self) -> bool:
         """Whether an error of the toolkit, not of the data, is the reason. Such a query is tried again."""
         return INTERNAL in self.reason or INTERNAL in self.remark
+
+    def __repr__(self) -> str:
+        if self.world_from_rig is None:
+            return f"QueryResult({self.status_text})"
+        position = ", ".join(f"{x:.3f}" for x in self.world_from_rig[:3, 3])
+        return f"QueryResult({self.status_text}, at ({position}), {self.num_inliers} inliers, {self.found_by})"
 
     def scaled(self, factor: float) -> Self:
         """Return the result with all lengths multiplied by a factor."""

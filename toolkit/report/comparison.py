@@ -14,16 +14,18 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from toolkit.capture import Capture
 from toolkit.capture.devices import extra_devices
 from toolkit.capture.names import allow_outside
 from toolkit.errors import ArtifactError, ToolkitError
-from toolkit.figures.inspection import InspectedPair
 from toolkit.figures.query_images import draw_localization
 from toolkit.figures.style import BLUE, GREEN, ORANGE, SKY, VERMILLION, new_figure, number, percent, styled
 from toolkit.files import SceneFiles, require_current, require_whole
 from toolkit.geometry import Floats, Ints
 from toolkit.report.page import off_by, read_run, seconds_text
+from toolkit.results.localized import LocalizedPair
 from toolkit.results.metrics import is_below, named_as_meters, parse_threshold, threshold_text, unit_of
+from toolkit.results.opening import SESSIONS_ROOT, how_localized
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -78,6 +80,10 @@ class Comparison:
         parts += ["time and peak memory; reused results, also those of another run, count as none"]
         parts += [resources.to_string()] + ([self.settings.to_string()] if len(self.settings) else [])
         return "\n".join([*parts, *(f"Note: {message}" for message in self.messages)])
+
+    def _repr_html_(self) -> str:
+        tables = readable(self)
+        return "".join(tables[name].to_html() for name in ("recall", "settings") if len(tables[name]))
 
     def summary(self) -> dict[str, Any]:
         """Return the comparison as plain values for scripts, with every pair and every query won or lost."""
@@ -395,7 +401,10 @@ def _draw_query(comparison: Comparison, query: Mapping[str, Any], run: str) -> "
     i = comparison.names.index(run)
     manifest, files = comparison.records[i]["manifest"], SceneFiles(comparison.folders[i], query["scene"])
     with extra_devices(manifest.get("extra_devices", [])), allow_outside(manifest.get("allow_outside", False)):
-        pair = InspectedPair(query["map_device"], query["query_device"], files.poses_dir).localized
+        devices = query["map_device"], query["query_device"]
+        attributes = how_localized(files.poses_csv(*devices).with_suffix(".h5"))[1]
+        capture = Capture.from_sessions_root(attributes[SESSIONS_ROOT])
+        pair = LocalizedPair.open(capture, *devices, files.poses_dir, files.maps)
         table = pair.results.table
         rows = np.flatnonzero((table["timestamp"] == query["timestamp"]) & (table["device_id"] == query["device_id"]))
         if not len(rows):

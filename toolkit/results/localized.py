@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from toolkit.capture import Capture, Session
 from toolkit.geometry import Floats, Ints
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.result import QueryResult
+from toolkit.pose.base import View
+from toolkit.pose.result import QueryResult, Status
 from toolkit.results.metrics import is_posed
 from toolkit.results.pair import PairResults
 
@@ -43,7 +44,8 @@ class ShownImage:
     """A posed image and its correspondences."""
 
     name: str
-    path: Path
+    image: Path | NDArray[np.uint8]
+    """File, or pixels (H, W) or (H, W, 3) RGB."""
     camera: "pycolmap.Camera"
     world_from_cam: Floats
     """(4, 4); NaN if unknown."""
@@ -83,6 +85,9 @@ class QueryDetails:
     """Map images that it was localized with, best first."""
     rejected: Sequence[ShownImage] = ()
     """References that contradict the references used."""
+    result: QueryResult = field(default_factory=lambda: QueryResult(Status.FAILED))
+    rig_from_cam: Floats = field(default_factory=lambda: np.eye(4))
+    """Pose of the first image, (4, 4)."""
 
     @property
     def has_matches(self) -> bool:
@@ -96,7 +101,26 @@ class QueryDetails:
             chosen = np.isin(image.matches, self.cameras[0].matches)
             return replace(image, **{name: getattr(image, name)[chosen] for name in _OF_A_MATCH})
 
-        return QueryDetails(self.cameras[:1], list(map(reduced, self.references)), self.rejected)
+        return replace(self, cameras=self.cameras[:1], references=list(map(reduced, self.references)))
+
+    @property
+    def rivals(self) -> list[tuple[Floats, float]]:
+        """world_from_cam (4, 4) of the first image at each rival pose, and the rival's share of the support."""
+        return [(rival.world_from_rig @ self.rig_from_cam, rival.support) for rival in self.result.rivals]
+
+    @property
+    def position_covariance(self) -> Floats | None:
+        """Covariance (3, 3) of the first image's position in the world, square meters; None if it is unknown.
+
+        A small motion of the rig in its own frame, rotation w and translation t, moves a camera at c by t + w x c.
+        """
+        pose, covariance = self.result.world_from_rig, self.result.covariance
+        if pose is None or covariance is None:
+            return None
+        x, y, z = self.rig_from_cam[:3, 3]
+        lever = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
+        moves = pose[:3, :3] @ np.hstack([lever, np.eye(3)])
+        return np.asarray(moves @ covariance @ moves.T)
 
     def captioned_references(self) -> list[tuple[ShownImage, str, bool]]:
         """Return at most `REFERENCES` references, up to two of them rejected: image, caption, whether used."""
@@ -191,39 +215,73 @@ class LocalizedPair:
             self.results.unit,
         )
 
-    def details(self, k: int, result: QueryResult | None = None) -> QueryDetails:
-        """Return images, correspondences and references of query k, as stored or of another result."""
-        session, rows = self.query_session, self.rows[k]
-        query = self.results[k] if result is None else result
-        pose = np.full((4, 4), np.nan) if query.world_from_rig is None else query.world_from_rig
-        found, cameras = query.correspondences, []
-        for row, world_from_cam in zip(rows.tolist(), pose @ session.rig_from_cam(rows), strict=True):
-            name = session.image_name(row)
-            number = query.images.index(name) if name in query.images else -1
-            matches = np.flatnonzero(found.camera == number)
-            cameras.append(_shown(session, row, world_from_cam, query, matches, found.pixels[matches]))
-        cameras.sort(key=lambda camera: -camera.num_inliers)
-        used = {name: number for number, name in enumerate(query.references)}
-        rejected = self._references(query, dict.fromkeys(query.rejected, -1))
-        return QueryDetails(cameras, self._references(query, used), rejected)
+    def details(self, k: int) -> QueryDetails:
+        """Return images, correspondences and references of query k."""
+        true = self.true_poses[k]
+        return query_details(self.results[k], *self.views(k), self.map_session, true if is_posed(true) else None)
 
-    def _references(self, query: QueryResult, numbers: Mapping[str, int]) -> list[ShownImage]:
-        """Return the first few map images with their correspondences; `numbers` are those of references by name."""
-        session, matches, images = self.map_session, query.correspondences, []
-        for name in [name for name in numbers if name in session.row_of_name][:REFERENCES]:
-            row, views = session.row_of_name[name], np.flatnonzero(matches.view_reference == numbers[name])
-            pose = session.world_from_cam([row])[0]
-            images.append(_shown(session, row, pose, query, matches.view_of[views], matches.view_pixels[views]))
-        return images
+    def views(self, k: int) -> tuple[list[View], Floats]:
+        """Return the images of query k, and their rig_from_cam (C, 4, 4)."""
+        session, rows = self.query_session, self.rows[k]
+        named = ((session.image_name(row), session.image_path(row)) for row in rows.tolist())
+        cameras = session.cameras(rows)
+        views = [View(*of_file, camera, in_map=False) for of_file, camera in zip(named, cameras, strict=True)]
+        return views, session.rig_from_cam(rows)
+
+
+def query_details(
+    result: QueryResult,
+    views: Sequence[View],
+    rig_from_cams: Floats,
+    map_session: Session,
+    world_from_rig_true: Floats | None = None,
+) -> QueryDetails:
+    """Return images, correspondences and references of a query.
+
+    Args:
+        result: how it was localized.
+        views, rig_from_cams: its images and their poses (C, 4, 4).
+        world_from_rig_true: its true pose (4, 4), if known.
+    """
+    unknown = np.full((4, 4), np.nan)
+    pose = unknown if result.world_from_rig is None else result.world_from_rig
+    true = unknown if world_from_rig_true is None else world_from_rig_true
+    found, cameras = result.correspondences, []
+    for view, rig_from_cam in zip(views, rig_from_cams, strict=True):
+        number = result.images.index(view.name) if view.name in result.images else -1
+        matches = np.flatnonzero(found.camera == number)
+        of_image = view.name, view.image, view.camera, pose @ rig_from_cam
+        cameras.append((_shown(*of_image, result, matches, found.pixels[matches], true @ rig_from_cam), rig_from_cam))
+    cameras.sort(key=lambda camera: -camera[0].num_inliers)
+    used = _references(map_session, result, {name: number for number, name in enumerate(result.references)})
+    rejected = _references(map_session, result, dict.fromkeys(result.rejected, -1))
+    return QueryDetails([image for image, _ in cameras], used, rejected, result, cameras[0][1])
+
+
+def _references(session: Session, result: QueryResult, numbers: Mapping[str, int]) -> list[ShownImage]:
+    """Return the first few map images with their correspondences; `numbers` are those of references by name."""
+    matches, images = result.correspondences, []
+    for name in [name for name in numbers if name in session.row_of_name][:REFERENCES]:
+        row, views = session.row_of_name[name], np.flatnonzero(matches.view_reference == numbers[name])
+        of_image = name, session.image_path(row), session.cameras([row])[0], session.world_from_cam([row])[0]
+        true = session.world_from_cam([row], ground_truth=True)[0]
+        images.append(_shown(*of_image, result, matches.view_of[views], matches.view_pixels[views], true))
+    return images
 
 
 def _shown(
-    session: Session, row: int, pose: Floats, query: QueryResult, matches: Ints, pixels: Floats
+    name: str,
+    image: Path | NDArray[np.uint8],
+    camera: "pycolmap.Camera",
+    world_from_cam: Floats,
+    result: QueryResult,
+    matches: Ints,
+    pixels: Floats,
+    world_from_cam_true: Floats,
 ) -> ShownImage:
-    found, sensor = query.correspondences, str(session.images["sensor_id"].iloc[row])
+    found = result.correspondences
     return ShownImage(
-        *(session.image_name(row), session.image_path(row), session.camera(sensor), pose, pixels),
+        *(name, image, camera, world_from_cam, pixels),
         *(found.points[matches], matches, found.inlier[matches]),
-        session.world_from_cam([row], ground_truth=True)[0],
-        found.found_by[matches],
+        *(world_from_cam_true, found.found_by[matches]),
     )

@@ -235,13 +235,14 @@ def pairs_of(poses_dir: str | Path) -> list[Path]:
     return [path for path in tables if all(pair_devices(path.stem)) and not of_sequence(path.stem)]
 
 
-def find_query(query: object, images: Mapping[str, int], count: int) -> int:
-    """Return the number of a query.
+def find_query(query: object, images: Mapping[str, int], count: int, what: str = "query") -> int:
+    """Return the number of a query, or of what else images have.
 
     Args:
         query: its number, the name of one of its images, or a unique end of the name.
         images: number of the query by the name of each image.
         count: number of queries.
+        what: what it is, for messages.
 
     Raises:
         ArtifactError: no query matches, or several do; names the nearest.
@@ -249,15 +250,16 @@ def find_query(query: object, images: Mapping[str, int], count: int) -> int:
     if isinstance(query, int | np.integer) and not isinstance(query, bool):
         if 0 <= query < count:
             return int(query)
-        raise ArtifactError(f"query: found {query}, expected a number from 0 to {count - 1}, or the name of an image.")
+        found = f"found {query}, expected a number from 0 to {count - 1}, or the name of an image"
+        raise ArtifactError(f"{what}: {found}.")
     if not isinstance(query, str | Path):
-        raise ArtifactError(f"query: found {query!r}, expected a number or the name of an image.")
+        raise ArtifactError(f"{what}: found {query!r}, expected a number or the name of an image.")
     name = image_name(str(query))
     numbers = {images[name]} if name in images else {images[image] for image in images if image.endswith(f"/{name}")}
     if len(numbers) == 1:
         return numbers.pop()
     if numbers:
-        raise ArtifactError(f"query: {len(numbers)} queries have an image name that ends in {name!r}; give more of it.")
+        raise ArtifactError(f"{what}: {len(numbers)} have an image name that ends in {name!r}; give more of it.")
     close = difflib.get_close_matches(name, images, n=1, cutoff=0.0)
-    hint = f"The nearest of its {len(images)} images is {close[0]!r}." if close else "There are no queries."
-    raise ArtifactError(f"query: no query has an image {str(query)!r}. {hint}")
+    hint = f"The nearest of its {len(images)} images is {close[0]!r}." if close else "There are none."
+    raise ArtifactError(f"{what}: no {what} has an image {str(query)!r}. {hint}")

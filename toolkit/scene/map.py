@@ -6,8 +6,9 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
+from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pycolmap
@@ -15,14 +16,23 @@ from numpy.typing import NDArray
 
 from toolkit import geometry
 from toolkit.capture import Capture, Session, masks
+from toolkit.capture.images import thumbnails
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import ArtifactError, ManifestError
 from toolkit.features.features import KINDS
-from toolkit.features.matching import AnyMethod, DeferredMethod, LocalMethod, create_local_methods, weights_files
+from toolkit.features.matching import (
+    AnyMethod,
+    DeferredMethod,
+    LocalMethod,
+    create_local_methods,
+    resolve_auto,
+    weights_files,
+)
 from toolkit.features.stores import FeatureStore, OnDemandFeatures, extract_session
 from toolkit.files import SceneFiles, fingerprint, require_current
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import LocalizeSettings
+from toolkit.manifest.settings import expand
 from toolkit.mapping.build import build_map
 from toolkit.mapping.local_map import Consistency, LocalMap, map_path
 from toolkit.mapping.pose_consistency import NOMINAL_DEPTH, USUAL_DEPTHS_M
@@ -46,7 +56,8 @@ from toolkit.prediction.feed_forward import FeedForwardLocalizer
 from toolkit.prediction.hybrid import HybridLocalizer
 from toolkit.prediction.interface import Predictor
 from toolkit.prediction.network import open_predictor
-from toolkit.scene.opening import (
+from toolkit.results.metrics import is_posed, length_unit
+from toolkit.results.opening import (
     RETRIEVAL,
     SESSIONS_ROOT,
     Localized,
@@ -55,16 +66,24 @@ from toolkit.scene.opening import (
     pairs_in_map,
     session_fingerprint,
 )  # fmt: skip
+from toolkit.results.pair import find_query
+from toolkit.scene.located import Located, Retrieved, ranks, show_matches
 from toolkit.scene.query import Image, query_from
 from toolkit.scene.search import ReferenceSearch
 from toolkit.threads import fixed_sums
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from toolkit.figures.answers import Answer
+    from toolkit.viewer.scene_view import View3D
 
 log = logging.getLogger(__name__)
 
 WITHOUT_FEATURES = ("feed_forward", "nearest")
 """Methods that need no local features of the queries."""
-FIXED_BY_MAP = ("features", "matcher", "map", "unit", "world_up")
-"""Settings that the stored features and map points depend on, so they cannot change for a query."""
+FIXED_BY_MAP = ("unit", "world_up")
+"""Settings that the length of the map and the turns of its images depend on, so they cannot change for a query."""
 ODD_DEPTHS_M = (0.1, 200.0)
 """Plausible range of a map's median depth, meters; outside, the map may be in another unit."""
 NEAR, NEAR_DEG = 10.0, 60.0
@@ -103,6 +122,8 @@ class Map:
     """Whether the run localized with reranked references."""
     predictor: Predictor | None = None
     """Network of `feed_forward` and `hybrid`; None: opened as the settings say."""
+    original: LocalMap | None = None
+    """The run's first map, for a map with changed settings: its length and consistency hold for that one, too."""
 
     def build(self, workers: int = 1, skip_existing: bool = True) -> "Map":
         """Extract features of the map session and triangulate points, or load them; return the map with them."""
@@ -180,6 +201,16 @@ class Map:
         """The map session."""
         return self.capture[f"{self.device}_map"]
 
+    def _repr_html_(self) -> str:
+        session, points = self.session, self.points
+        kinds: list[AnyMethod] = [*self.kinds, *self.escalation]
+        features = ", ".join(kind.name for kind in kinds) or "no features"
+        text = f"{len(session)} images, {0 if points is None else len(points.points)} points; "
+        text += f"{self.settings.method} with {features}. {self.remarks}"
+        rows = session.camera_rows[:: max(1, len(session) // 6)][:6].tolist()
+        head = f"<p><b>map of {escape(self.device)}</b> in {escape(self.capture.name)}: {escape(text)}</p>"
+        return head + thumbnails(session.image_path(row) for row in rows)
+
     # The way of an image
 
     query = staticmethod(query_from)
@@ -201,23 +232,24 @@ class Map:
             ImageError: an image cannot be read, or has another size than its camera.
         """
         query = self._with_features(query)
-        if self.files is None or query.descriptors:
+        if self.files is None or len(query.descriptors):
             return query
         return replace(query, descriptors=self.search.describe(query, self.kinds))
 
     @fixed_sums
-    def retrieve(self, query: Query, k: int | None = None, near: RoughPose | None = None) -> list[References]:
-        """Return the references of each image of a described query, as the run would find them.
+    def retrieve(self, query: Query, k: int | None = None, near: RoughPose | None = None) -> "Retrieved":
+        """Return the references of each image of a query, as the run would find them.
 
         Args:
-            query: what `describe` returned.
+            query: described here if it is not.
             k: number of references; None: as many as in the run.
             near: a rough pose of the query. Its references then look the same way from nearby, if there are any.
 
         Raises:
             ArtifactError: the map was not opened from a run, or was embedded by another embedder.
         """
-        references, allowed = list[References](), list[NDArray[np.bool_] | None]()
+        query = self.describe(query)
+        references, allowed = Retrieved(self, query), list[NDArray[np.bool_] | None]()
         if near is not None:
             allowed = [self._may_show(pose, near) for pose in near.world_from_rig @ query.rig_from_cams]
         for rows, scores in self.search.find(query, k, allowed):
@@ -228,12 +260,39 @@ class Map:
     def match(
         self, query: Query, references: Sequence[References], localizer: Localizer | None = None
     ) -> QueryMatches:
-        """Return the matches of a described query with its references; they are computed when they are needed.
+        """Return the matches of a query with its references; they are computed when they are needed.
 
         Localizers assume map lengths, and so do the matches. `localizer` is that of the map or, with the fallback
         features, `fallback`; the same one solves the matches.
         """
-        return (localizer or self.localizer).match(query.scaled(1 / self.length), references)
+        return (localizer or self.localizer).match(self._with_features(query).scaled(1 / self.length), references)
+
+    def show_matches(self, matches: QueryMatches, reference: int = 1, image: int = 0) -> "Figure":
+        """Draw the matches by descriptors of one image of a query with one of its references.
+
+        Args:
+            matches: what `match` returned.
+            reference: rank of the reference, from 1.
+            image: number of the query image, from 0.
+
+        Raises:
+            ArtifactError: there is no such image or reference, or the method does not match keypoints.
+        """
+        return show_matches(self, matches, reference, image)
+
+    def show_3d(self) -> "View3D":
+        """Return the map in 3D: points and cameras; see `QueryResult.show_3d`."""
+        from toolkit.viewer.scene_view import View3D
+
+        return View3D([], False, self.session, self.points, self.settings.world_up, length_unit(self.record()))
+
+    def find_image(self, name: str) -> int:
+        """Return the index of a map image, as `References` have it, given its name or a unique end of it.
+
+        Raises:
+            ArtifactError: no map image has this name, or several do; names the nearest.
+        """
+        return find_query(name, self.index_of, len(self.index_of), "map image")
 
     def solve(
         self,
@@ -246,7 +305,12 @@ class Map:
         """Return the pose of a query from its matches, in the unit of the map's poses; see `Localizer.solve`."""
         in_lengths = [prior.scaled(1 / self.length) for prior in priors]
         result = (localizer or self.localizer).solve(matches, prediction, in_lengths)
-        return self.finished(query, result.scaled(self.length))
+        result = self.finished(query, result.scaled(self.length))
+        # Results may be many, so they keep neither pixels of files nor features.
+        views = [replace(view, _decoded={}) for view in query.views]
+        lean, references = replace(query, views=views, features=[], network_matches=[]), matches.references
+        context = Located(partial(self._answer, lean, references), lambda: (self, lean, references))
+        return replace(result, context=context)
 
     @fixed_sums
     def locate(
@@ -387,6 +451,24 @@ class Map:
         ]
         return replace(query, features=features, network_matches=[])
 
+    def _answer(self, query: Query, references: Sequence[References], result: QueryResult) -> "Answer":
+        from toolkit.figures.answers import Answer
+
+        return Answer(
+            result, self.settings, query.views, query.rig_from_cams, self.session, self.points,
+            length_unit(self.record()), self._true_pose(query), "query", None, ranks(self, references),
+        )  # fmt: skip
+
+    def _true_pose(self, query: Query) -> Floats | None:
+        """Return world_from_rig (4, 4) of a query of a session by its ground truth; None if that is unknown."""
+        session_id, _, path = query.views[0].name.partition("/")
+        session = self.capture[session_id] if path and session_id in self.capture else None
+        row = None if session is None else session.row_of_name.get(query.views[0].name)
+        if session is None or row is None:
+            return None
+        true = session.world_from_cam([row], ground_truth=True)[0] @ geometry.invert(query.rig_from_cams[0])
+        return true if is_posed(true) else None
+
     # What the way is made of
 
     @cached_property
@@ -401,13 +483,13 @@ class Map:
         if settings.method == "nearest":
             posed = PosedImages.of_session(self.session, None, self.length)
             return NearestLocalizer(posed.names, posed.world_from_cams)
-        if not self.kinds:
+        if self._unmapped and not settings.predicts:
+            return self._on_demand_localizer(self._unmapped)
+        if not self.mapped:
             raise ArtifactError(
                 f"The map of {self.device!r} was built for another method than {settings.method!r} and has no points, "
                 f"which it needs. Localize with {settings.method!r} first."
             )
-        if settings.map is None:
-            return self._on_demand_localizer(self.kinds)
         pnp = PnpLocalizer(self.in_lengths, settings.pnp, settings.seed)
         if not settings.predicts:
             return pnp
@@ -423,8 +505,14 @@ class Map:
         applies = self.escalation and self.settings.method in ("pnp", "hybrid")
         if not applies or not self.consistency.trusted:  # no features make up for a wrong map
             return None
-        kinds: list[AnyMethod] = [*(self.kinds if self.settings.map is None else ()), *self.escalation]
+        kinds: list[AnyMethod] = [*self._unmapped, *self.escalation]
         return self._on_demand_localizer(kinds, self.localizer.image_names)
+
+    @property
+    def _unmapped(self) -> list[LocalMethod]:
+        """Kinds of features without points in the map: their points are triangulated for each query."""
+        mapped = {kind.name for kind in self.mapped}
+        return [kind for kind in self.kinds if kind.name not in mapped]
 
     def _on_demand_localizer(self, kinds: Sequence[AnyMethod], names: list[str] | None = None) -> OnDemandLocalizer:
         """Return a localizer with the points of the map, and for the given kinds points triangulated for each query.
@@ -442,22 +530,45 @@ class Map:
         )
 
     def changed(self, changes: Mapping[str, Any]) -> "Map":
-        """Return the map with changed settings; it shares features, points and descriptors with this one.
+        """Return the map with changed settings of the localize stage; it shares what stays the same with this one.
+
+        If features, or the settings of the map's points, change, points are triangulated for each query from its
+        references, as the map has none of this kind.
 
         Raises:
-            ManifestError: a setting is unknown, or the stored features or the map depend on it.
+            ManifestError: a setting is unknown, or the unit or the up direction of the map would change.
+            WeightsError: a network of the changed settings has no weights.
         """
-        settings, before = LocalizeSettings.of(self.settings, changes), self.settings
+        before, changes = self.settings, expand(LocalizeSettings, changes)
+        features = changes.get("features", {})
+        if "kinds" in features and "escalation" not in features:
+            rest = [name for name in before.features.escalation if name not in features["kinds"]]
+            changes |= {"features": {**features, "escalation": rest}}
+        settings = LocalizeSettings.of(before, changes)
         if fixed := [name for name in FIXED_BY_MAP if getattr(settings, name) != getattr(before, name)]:
             raise ManifestError(
-                f"{', '.join(fixed)}: found other settings than those of the run. The stored features and the map "
-                "depend on them, so they cannot change for one query. Settings that can: pnp, predictor, method, seed. "
-                f"To change these: python -m toolkit run MANIFEST --set localize.{fixed[0]}=..."
+                f"localize.{fixed[0]}: cannot change for one query, as the whole map depends on it. "
+                f"To change it: python -m toolkit run MANIFEST --set localize.{fixed[0]}=..."
             )
         other = copy.copy(self)
-        other.settings = settings
-        for name in ("localizer", "fallback", "index_of", "_world_from_cams"):
+        other.settings, other.original = settings, self._first
+        for name in ("localizer", "fallback", "index_of", "in_lengths", "points", "_world_from_cams"):
             other.__dict__.pop(name, None)
+        if settings.map != before.map and not settings.predicts:
+            other.mapped = []
+        anew = settings.features != before.features or settings.matcher != before.matcher
+        if anew or not self.kinds:
+            kinds, other.escalation = create_methods(resolve_auto(settings))
+            extracted = {kind.name: kind.extractor.settings for kind in self.kinds}
+            kept = {kind.name: kind for kind in kinds if extracted.get(kind.name) == kind.extractor.settings}
+            other.mapped = [
+                MappedFeatures(kind.map, kind.features, kind.name, kept[kind.name].matcher)
+                for kind in other.mapped
+                if kind.name in kept
+            ]
+            mapped = [kind.name for kind in other.mapped]
+            other.kinds = sorted(kinds, key=lambda kind: kind.name not in mapped)  # as `OnDemandLocalizer` wants them
+            other.__dict__.pop("_on_demand", None)
         return other
 
     @cached_property
@@ -510,20 +621,29 @@ class Map:
         return {}
 
     @property
+    def _first(self) -> LocalMap | None:
+        return self.original or (self.mapped[0].map if self.mapped else None)
+
+    @property
     def consistency(self) -> Consistency:
         """How well the poses of the map agree with its images; unknown if the map has no points."""
-        return self.mapped[0].map.consistency if self.mapped else Consistency()
+        return self._first.consistency if self._first else Consistency()
 
     @property
     def refined_poses(self) -> dict[str, Floats]:
         """Pose (4, 4) of each map image by its name, if the map was built with refined poses; else empty."""
-        refined = self.mapped and self.settings.map is not None and self.settings.map.refine_poses
-        return self.mapped[0].map.poses if refined else {}
+        refined = self._first and self.settings.map is not None and self.settings.map.refine_poses
+        return self._first.poses if self._first and refined else {}
 
     @property
     def length(self) -> float:
         """The length that localizers treat as one meter, in the unit of the poses; see `Survey.length`."""
-        return self.mapped[0].map.length if self.mapped else 1.0
+        return self._first.length if self._first else 1.0
+
+    @cached_property
+    def points(self) -> LocalMap | None:
+        """The triangulated points of all kinds of features; None without points."""
+        return LocalMap.pooled([kind.map for kind in self.mapped]) if self.mapped else self.original
 
     @cached_property
     def in_lengths(self) -> list[MappedFeatures]:
@@ -533,7 +653,7 @@ class Map:
     @property
     def remarks(self) -> str:
         """Warnings for the user about the map; empty if there are none, or if the map has no points."""
-        if not self.mapped:
+        if self._first is None:
             return ""
         parts, depth = [self.consistency.text, self._noise], self.length * USUAL_DEPTHS_M[int(self.length > 1)]
         metric = self.settings.unit and self.length != 1 and self.consistency.verdict != "inconsistent"

@@ -1,9 +1,12 @@
 """A run in the hand: what a manifest made."""
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import pandas as pd
 
@@ -12,10 +15,29 @@ from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles, pair_devices, read_json
 from toolkit.geometry import Ints
 from toolkit.pose.base import Query
+from toolkit.pose.result import QueryResult, statuses
+from toolkit.results.opening import SESSIONS_ROOT, how_localized, localized_scenes, no_such_run
 from toolkit.results.pair import PairResults, find_query, pairs_of
 from toolkit.runs.folder import RECORD
 from toolkit.scene.map import Map
-from toolkit.scene.opening import SESSIONS_ROOT, how_localized, localized_scenes, no_such_run
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page of a run, which a notebook shows as a link."""
+
+    path: Path
+
+    @classmethod
+    def of(cls, path: Path) -> "Page":
+        if not path.is_file():
+            raise ArtifactError.at(path, "no such page", do="Finish the run: python -m toolkit run MANIFEST.")
+        return cls(path)
+
+    def _repr_html_(self) -> str:
+        # Relative to the notebook: JupyterLab opens only what lies below its own folder.
+        link = quote(os.path.relpath(self.path.resolve(), Path.cwd()))
+        return f"<a href='{link}' target='_blank'>{escape(str(self.path))}</a>"
 
 
 @dataclass(frozen=True)
@@ -35,6 +57,12 @@ class Run:
         if not (path / RECORD).is_file():
             raise no_such_run(path)
         return cls(path)
+
+    def _repr_html_(self) -> str:
+        queries, keys = self.queries, ["scene", "map_device", "query_device"]
+        of_status = queries.assign(status=statuses(queries["status"])).groupby([*keys, "status"])
+        counts = of_status.size().unstack(fill_value=0)
+        return f"<p><b>{escape(self.path.name)}</b>: {escape(str(self.path))}</p>{counts.to_html()}"
 
     @cached_property
     def record(self) -> dict[str, Any]:
@@ -58,10 +86,13 @@ class Run:
             device: `ios`, `hl`, `spot`.
             scene: name of the capture; None: the only one of the run.
         """
+        return Map.open(self.path, self._scene(scene), device)
+
+    def _scene(self, scene: str | None) -> str:
         if scene is None and len(self.scenes) != 1:
             found = ", ".join(self.scenes) or "none"
             raise ArtifactError(f"{self.path}: found the scenes {found}. Expected `scene`, the name of one of them.")
-        return Map.open(self.path, scene or self.scenes[0], device)
+        return scene or self.scenes[0]
 
     @cached_property
     def queries(self) -> pd.DataFrame:
@@ -78,6 +109,36 @@ class Run:
         if not tables:
             return pd.DataFrame(columns=[*keys, "status"])
         return pd.concat(tables, names=keys).reset_index(keys).reset_index(drop=True)
+
+    def result(self, name: str = "worst", map_device: str | None = None, scene: str | None = None) -> QueryResult:
+        """Return how a query was localized, with its stored matches.
+
+        Args:
+            name: of one of its images, see `__getitem__`; or `worst`, the worst query.
+            map_device: device of the map; None: of the maps that the query was localized in, the one where it is worst.
+            scene: name of the capture; None: the only one of the run.
+
+        Raises:
+            ArtifactError: no query has this name, or several do; or its stored results are damaged.
+        """
+        from toolkit.scene.inspection import WorstQueries
+
+        poses = SceneFiles(self.path, self._scene(scene)).poses_dir
+        return WorstQueries(poses, map_device=map_device or "all").look(name).result
+
+    def report(self) -> "Page":
+        """Return a link to the report, as a notebook shows it.
+
+        Raises:
+            ArtifactError: the run has no report.
+        """
+        return Page.of(self.path / "report.html")
+
+    def compare(self, *others: "Run | str | Path") -> Any:
+        """Compare this run with others on their common queries, see `report.comparison.compare_runs`."""
+        from toolkit.report.comparison import compare_runs
+
+        return compare_runs([self.path, *(other.path if isinstance(other, Run) else other for other in others)])
 
     def __getitem__(self, name: str) -> Query:
         """Return a query of the run: the images of one device at one instant, of which one has this name.

@@ -23,7 +23,7 @@ from toolkit.files import SceneFiles, image_name
 from toolkit.geometry import unit
 from toolkit.manifest import EmbedSettings, RerankSettings, RetrieveSettings
 from toolkit.pose.base import Query, View
-from toolkit.scene.opening import read_settings
+from toolkit.results.opening import read_settings
 
 MAX_IN_MEMORY = 1 << 30
 """Largest size in bytes of global descriptors (float32) that an open map keeps in memory; larger ones stay on disk."""

@@ -15,10 +15,10 @@ import rerun.blueprint as rrb
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import shrunk
+from toolkit.figures.scene_3d import OUTLINE, PYRAMID, Eye
 from toolkit.figures.style import GRAY
-from toolkit.figures.top_view import places_of
 from toolkit.files import write_atomic
-from toolkit.geometry import Floats, rotation_to_quaternion, unit
+from toolkit.geometry import Floats, rotation_to_quaternion
 
 if TYPE_CHECKING:
     import pycolmap
@@ -119,16 +119,11 @@ def scene_view(poses: Floats, up: Floats, name: str) -> Any:
     Args:
         up: up direction (3,) of any length.
     """
-    eye, up = None, unit(up)
+    controls = None
     if len(poses):
-        place = places_of(poses[:, :3, 3])
-        here = poses[place == np.bincount(place).argmax()]
-        center, view = here[:, :3, 3].mean(0), here[:, :3, 2].mean(0)
-        view -= up * (view @ up)
-        reach = max(3.0, float(np.linalg.norm(np.ptp(here[:, :3, 3], axis=0))))
-        target = center + 0.3 * reach * view
-        eye = rrb.EyeControls3D(position=target - reach * view + 0.7 * reach * up, look_target=target, eye_up=up)
-    return rrb.Spatial3DView(origin="world", name=name, eye_controls=eye)
+        eye = Eye.of(poses, up)
+        controls = rrb.EyeControls3D(position=eye.position, look_target=eye.target, eye_up=eye.up)
+    return rrb.Spatial3DView(origin="world", name=name, eye_controls=controls)
 
 
 def camera_depth_m(centers: Floats) -> float:
@@ -150,6 +145,13 @@ def log_points(stream: rr.RecordingStream, points: ArrayLike, colors: NDArray[np
 def log_lines(stream: rr.RecordingStream, path: str, lines: Sequence[Floats], color: str) -> None:
     """Log lines, (n, 3) each."""
     stream.log(path, rr.LineStrips3D(lines, colors=rgb(color)), static=True)
+
+
+def pyramids(poses: Floats, depth_m: float) -> NDArray[np.float32]:
+    """Return cameras (N, 4, 4) as lines (N, 11, 3)."""
+    outline = (depth_m * PYRAMID)[OUTLINE]
+    lines = np.einsum("nij,kj->nki", poses[:, :3, :3], outline) + poses[:, None, :3, 3]
+    return lines.astype(np.float32)
 
 
 def hidden_camera() -> rr.Pinhole:

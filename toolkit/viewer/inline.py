@@ -3,6 +3,7 @@
 import html
 import io
 import os
+from collections.abc import Callable
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -41,9 +42,6 @@ def show_picture(path: str | Path) -> Any:
 def show_recording(path: str | Path, height: int = 600) -> Any:
     """Show a recording in a notebook: a link, the command that opens it, and the viewer itself.
 
-    This process serves the viewer, so it needs no network. There is no viewer when the pipeline runs the notebook,
-    because saved pages do not store its content.
-
     Args:
         height: height of the viewer, pixels.
 
@@ -67,16 +65,27 @@ def show_recording(path: str | Path, height: int = 600) -> Any:
             f"Open it in the project's environment with<br><code>{html.escape(open_command(path.resolve()))}</code></p>"
         )
     )
-    if TEXT_BARS in os.environ:
-        return None
     if path.stat().st_size > MAX_INLINE_BYTES:
         display(HTML("<p>It is too large to show here; use the command.</p>"))
+        return None
+    viewer = open_viewer(lambda: path, height)
+    if viewer is not None:
+        display(viewer)
+    return viewer
+
+
+def open_viewer(recording: Callable[[], Path], height: int = 600) -> Any:
+    """Return a viewer's widget with a recording, which `recording` returns; None where no viewer can be shown.
+
+    This process serves the viewer, so it needs no network. Saved pages do not store its content, so there is none when
+    the pipeline runs the notebook.
+    """
+    if TEXT_BARS in os.environ:
         return None
     os.environ.setdefault(ASSETS, "serve-local")
     with redirect_stdout(io.StringIO()):  # hide the address that it prints
         import rerun_notebook
 
     viewer = rerun_notebook.Viewer(width="auto", height=height)
-    viewer.send_rrd(path.read_bytes())
-    display(viewer)
+    viewer.send_rrd(recording().read_bytes())
     return viewer

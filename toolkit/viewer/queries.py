@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from toolkit.capture.images import prefetch, read_for_display
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.figures.style import ESTIMATED, GREEN, MAP, ORANGE, SKY, TRUE, draw_error_legend, error_colors
-from toolkit.geometry import Floats, local_origin, project, shifted
+from toolkit.geometry import Floats, local_origin, project, rotation_to_quaternion, shifted
 from toolkit.results.localized import REFERENCES, Localizations, QueryDetails, ShownImage, support_of
 from toolkit.results.metrics import is_posed
 from toolkit.viewer import blueprint as viewer
@@ -30,6 +30,8 @@ MAX_CAMERAS = 4
 KEPT_JPEGS = 256
 """References that are encoded once though several queries show them."""
 WHITE = [255, 255, 255]
+SURE_3D = 2.7955
+"""Radius of the 95 % region of a 3D normal distribution, standard deviations."""
 
 
 def record_localizations(
@@ -42,14 +44,16 @@ def record_localizations(
     details: Iterable[tuple[int, QueryDetails]] = (),
     up: ArrayLike | None = None,
     tracks: Mapping[str, Sequence[Floats]] | None = None,
+    rays: bool = False,
 ) -> Path:
     """Write a recording of queries in a map, and return its path.
 
     Entities: `world/{points,map_cameras}`, `world/queries/{estimated,true,error,failed}`,
     `world/recording/{odometry,frames}`. For the query chosen on the timeline `query`: `world/chosen/camera_<k>`,
-    `world/truth/camera_0`, `world/references/<rank>`, `world/chosen_points`, and `about`, a page of text. Errors are
-    colored by `figures.error_colors`. The viewer has numbers of single precision, so a world far from its origin (UTM,
-    ECEF) is shifted, see `geometry.local_origin`.
+    `world/truth/camera_0`, `world/references/<rank>`, `world/chosen_points`, `world/uncertainty` (95 % region of the
+    position), `world/rivals`, `world/rays`, and `about`, a page of text. Errors are colored by `figures.error_colors`.
+    The viewer has numbers of single precision, so a world far from its origin (UTM, ECEF) is shifted, see
+    `geometry.local_origin`.
 
     Args:
         map_poses: world_from_cam (N, 4, 4) of the map's images; NaN rows are skipped.
@@ -59,6 +63,7 @@ def record_localizations(
         up: up direction (3,); None: estimated from the map's cameras.
         tracks: positions (n, 3) of each piece of the query recordings: `odometry`, rigidly placed in the map, and
             `frames`, as estimated by the sequence stage.
+        rays: join the camera of the chosen query with the map points that it sees.
     """
     started = time.perf_counter()
     poses = map_poses[is_posed(map_poses)]
@@ -67,7 +72,7 @@ def record_localizations(
     up = np.asarray(up_of_cameras(poses) if up is None else up, np.float64)
     size = viewer.camera_depth_m(poses[:, :3, 3])
     count = 0
-    with viewer.open_recording(out, name, _layout(name, poses, up)) as stream:
+    with viewer.open_recording(out, name, _layout(name, poses, up, len(localizations.names) > 0)) as stream:
         stream.log("world", viewer.world_axes(up), static=True)
         viewer.log_points(stream, np.asarray(points) + shift, colors)
         _log_map_cameras(stream, poses, size)
@@ -75,7 +80,7 @@ def record_localizations(
         for kind, color in (("odometry", ORANGE), ("frames", SKY)):
             if tracks and tracks.get(kind):
                 viewer.log_lines(stream, f"world/recording/{kind}", [track + shift for track in tracks[kind]], color)
-        writer = _ChosenWriter(stream, localizations, 2 * size, shift)
+        writer = _ChosenWriter(stream, localizations, 2 * size, shift, rays)
         for number, chosen in prefetch(writer.read, details):
             writer.write(number, chosen)
             count += 1
@@ -84,9 +89,11 @@ def record_localizations(
     return Path(out)
 
 
-def _layout(name: str, poses: Floats, up: Floats) -> Any:
+def _layout(name: str, poses: Floats, up: Floats, has_queries: bool) -> Any:
     """Return the viewer's layout: the scene, and beside it the chosen query, its references and a text page."""
     scene = viewer.scene_view(poses, up, name)
+    if not has_queries:
+        return rrb.Blueprint(scene, collapse_panels=True)
     cameras = {f"query, camera {k}": f"world/chosen/camera_{k}" for k in range(MAX_CAMERAS)}
     ranked = {f"reference {rank}": f"world/references/{rank}" for rank in range(1, REFERENCES + 1)}
     # Show marks only in the 2D views: on the image planes of the 3D scene they would hide it.
@@ -107,10 +114,7 @@ def _layout(name: str, poses: Floats, up: Floats) -> Any:
 
 def _log_map_cameras(stream: rr.RecordingStream, poses: Floats, size: float) -> None:
     """Log the map's cameras as small pyramids, all in one entity."""
-    corners = size * np.array([[0, 0, 0], [-0.4, -0.3, 1], [0.4, -0.3, 1], [0.4, 0.3, 1], [-0.4, 0.3, 1.0]])
-    outline = corners[[0, 1, 2, 0, 3, 4, 0, 1, 4, 3, 2]]
-    lines = np.einsum("nij,kj->nki", poses[:, :3, :3], outline) + poses[:, None, :3, 3]
-    stream.log("world/map_cameras", rr.LineStrips3D(lines.astype(np.float32), colors=viewer.rgb(MAP)), static=True)
+    stream.log("world/map_cameras", rr.LineStrips3D(viewer.pyramids(poses, size), colors=viewer.rgb(MAP)), static=True)
 
 
 def _log_overview(stream: rr.RecordingStream, queries: Localizations, shift: Floats) -> None:
@@ -139,18 +143,23 @@ class _ChosenWriter:
     """Logs one query at a time, each in place of the one before; `shift` (3,) is added to all positions."""
 
     def __init__(
-        self, stream: rr.RecordingStream, queries: Localizations, camera_depth_m: float, shift: Floats
+        self, stream: rr.RecordingStream, queries: Localizations, camera_depth_m: float, shift: Floats, rays: bool
     ) -> None:
+        self._rays = rays
         self._stream, self._queries, self._depth_m, self._shift = stream, queries, camera_depth_m, shift
         self._sizes: dict[str, tuple[int, int]] = {}
         """Width and height of the images last logged, by entity."""
         self._jpeg_of = lru_cache(KEPT_JPEGS)(_jpeg_of)
 
+    def _jpeg(self, image: ShownImage) -> tuple[bytes, tuple[int, int]]:
+        pixels = image.image
+        return self._jpeg_of(pixels) if isinstance(pixels, Path) else viewer.small_jpeg(pixels, viewer.IMAGE_SIZE)
+
     def read(self, numbered: tuple[int, QueryDetails]) -> tuple[int, QueryDetails]:
         """Read the images of a query and keep them; return the arguments of `write`; thread-safe."""
         _, query = numbered
         for image in (*query.cameras[:MAX_CAMERAS], *(image for image, _, _ in query.captioned_references())):
-            self._jpeg_of(image.path)
+            self._jpeg(image)
         return numbered
 
     def write(self, number: int, query: QueryDetails) -> None:
@@ -179,6 +188,7 @@ class _ChosenWriter:
         ends = [image.world_from_cam[:3, 3] for image in query.references if located]
         lines = [np.stack([center, end]) + self._shift for end in ends]
         stream.log("world/lines", rr.LineStrips3D(lines, colors=viewer.rgb(ORANGE)))
+        self._log_doubt(query, points if self._rays and located else points[:0], center)
         text = [f"**query {number}: {describe(self._queries, number)}**", ""]
         text += [f"- {image.name}" for image in query.cameras]
         if query.has_matches:
@@ -189,6 +199,29 @@ class _ChosenWriter:
             text += ["", "No matches: the pose comes from the references as a whole.", ""]
         text += [f"{rank}. {image.name}: {caption}" for rank, (image, caption, _) in enumerate(references, start=1)]
         stream.log("about", rr.TextDocument("\n".join(text), media_type="text/markdown"))
+
+    def _log_doubt(self, query: QueryDetails, seen: Floats, center: Floats) -> None:
+        """Log the 95 % region of the position, the rival poses, and rays from the center (3,) to points (n, 3)."""
+        values, vectors = np.zeros(0), np.eye(3)
+        if query.position_covariance is not None:
+            values, vectors = np.linalg.eigh(query.position_covariance)
+            vectors = vectors * np.sign(np.linalg.det(vectors))
+        w, x, y, z = rotation_to_quaternion(vectors)
+        region = rr.Ellipsoids3D(
+            half_sizes=[SURE_3D * np.sqrt(np.maximum(values, 0))] if len(values) else [],
+            centers=[center + self._shift] if len(values) else [],
+            quaternions=[rr.Quaternion(xyzw=[x, y, z, w])] if len(values) else [],
+            colors=viewer.rgb(ESTIMATED),
+            fill_mode="majorwireframe",
+        )
+        self._stream.log("world/uncertainty", region)
+        poses = np.array([pose for pose, _ in query.rivals]).reshape(-1, 4, 4)
+        labels = [f"rival, {support:.0%} of the support" for _, support in query.rivals]
+        color = viewer.rgb(TRUE)
+        lines = viewer.pyramids(shifted(poses, self._shift) if len(poses) else poses, self._depth_m / 2)
+        self._stream.log("world/rivals", rr.LineStrips3D(lines, labels=labels, colors=color, show_labels=False))
+        rays = [np.stack([center, point]) + self._shift for point in seen]
+        self._stream.log("world/rays", rr.LineStrips3D(rays, colors=viewer.rgb(GREEN), radii=rr.Radius.ui_points(0.5)))
 
     def _log_image(self, path: str, image: ShownImage | None, color: str, residuals: bool) -> None:
         """Log an image (None: a gray one) with its camera, keypoints and, for `residuals`, projected points."""
@@ -202,7 +235,7 @@ class _ChosenWriter:
             data, _ = viewer.small_jpeg(np.full((height, width, 3), 60, np.uint8), max(width, height))
             stream.log(path, viewer.hidden_camera())
         else:
-            data, self._sizes[path] = self._jpeg_of(image.path)
+            data, self._sizes[path] = self._jpeg(image)
             located = bool(is_posed(image.world_from_cam))
             if located:
                 stream.log(path, viewer.transform_of(shifted(image.world_from_cam, self._shift)))

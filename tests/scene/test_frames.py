@@ -17,9 +17,9 @@ from toolkit.features.sift import SiftExtractor
 from toolkit.manifest import LocalizeSettings, SequenceSettings
 from toolkit.pose.base import RoughPose
 from toolkit.pose.result import QueryResult, Status
+from toolkit.scene import frames
+from toolkit.scene.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
 from toolkit.scene.map import Map
-from toolkit.sequences import frames
-from toolkit.sequences.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
 from toolkit.sequences.odometry import Odometry
 from toolkit.sequences.piece import queries_of
 from toolkit.sequences.pose_graph import place_piece

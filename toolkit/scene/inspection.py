@@ -1,103 +1,38 @@
 """Inspect one query of a finished run: the stored results of the localize stage in words, numbers and figures.
 
-Nothing here localizes, except `Inspection.again`.
+Nothing here localizes, except `what_if` of the results.
 """
 
-import json
 import os
-import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from toolkit.capture import Capture
 from toolkit.errors import OF_THE_DATA, ArtifactError, ToolkitError
-from toolkit.figures.answers import Answer, draw_answers
+from toolkit.figures.answers import Answer
 from toolkit.figures.query_images import shown_name
-from toolkit.figures.style import shown
 from toolkit.files import SceneFiles, image_name, pair_devices, read_references, require_current
-from toolkit.manifest import LocalizeSettings, nearest
+from toolkit.manifest import nearest
+from toolkit.pose.base import Query, References
 from toolkit.pose.result import QueryResult
 from toolkit.results.localized import LocalizedPair
-from toolkit.results.metrics import worst_first
+from toolkit.results.metrics import is_posed, worst_first
+from toolkit.results.opening import RETRIEVAL, SESSIONS_ROOT, how_localized
 from toolkit.results.pair import find_query
 from toolkit.runs.kernel import TEXT_BARS
+from toolkit.scene.located import Located
 from toolkit.scene.map import WITHOUT_FEATURES, Map
-from toolkit.scene.opening import RETRIEVAL, SESSIONS_ROOT, how_localized
 from toolkit.scene.stored import StoredQueries
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 WORST = "worst"
 """Alias for the number of the worst query."""
-
-
-@dataclass(frozen=True, repr=False)
-class Inspection(Answer):
-    """One query of a pair, as it was localized. A notebook displays its figure."""
-
-    of: "InspectedPair" = field(kw_only=True)
-    """The pair that it belongs to."""
-
-    def again(self, changes: Mapping[str, Any] | None = None) -> "Comparison":
-        """Localize the query again, from the stored features and references, with some settings changed.
-
-        Args:
-            changes: settings that differ from those of the run, such as `{"pnp": {"min_inliers": 30}}`.
-
-        Returns:
-            This answer and the new one. Nothing is written.
-
-        Raises:
-            ManifestError: a setting does not exist, or the features or the map depend on it.
-            ToolkitError: features, the map or weights of the run are missing.
-        """
-        return Comparison(self, self.of.localize(self.number, changes or {}), dict(changes or {}))
-
-    @cached_property
-    def figure(self) -> "Figure":
-        title = f"{self.headline}\n{shown_name(self.name, 110)}\n{textwrap.fill(self.reason, 130)}"
-        return draw_answers([self], title)
-
-    def _repr_mimebundle_(self, **_: Any) -> dict[str, bytes]:
-        return shown(self.figure)
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """One query localized twice. A notebook displays its figure."""
-
-    before: Inspection
-    after: Inspection
-    changes: dict[str, Any]
-    """Settings that were changed."""
-
-    @cached_property
-    def table(self) -> pd.DataFrame:
-        """Status, method, numbers, errors and seconds as texts; columns before and after."""
-        both = {"before": self.before, "after": self.after}
-        texts = {name: {"status": one.result.status_text, **one.texts} for name, one in both.items()}
-        return pd.DataFrame(texts, dtype=object)
-
-    @cached_property
-    def figure(self) -> "Figure":
-        """Both answers side by side."""
-        changed = json.dumps(self.changes)[1:-1] if self.changes else "no setting changed"
-        first = self.before.headline.rpartition(":")[0]
-        return draw_answers([self.before, self.after], f"{first}, localized again\n{textwrap.fill(changed, 120)}")
-
-    def __repr__(self) -> str:
-        return f"{self.changes or 'nothing changed'}\nbefore: {self.before!r}\nafter: {self.after!r}"
-
-    def _repr_mimebundle_(self, **_: Any) -> dict[str, bytes]:
-        return shown(self.figure)
 
 
 class InspectedPair:
@@ -132,7 +67,7 @@ class InspectedPair:
             )
         self.map_device, self.label = map_device, f"{query_device} in the map of {map_device}"
         self._h5 = pairs[map_device, query_device]
-        files = SceneFiles(self._h5.parents[2], self._h5.parents[1].name)
+        files = self._files = SceneFiles(self._h5.parents[2], self._h5.parents[1].name)
         self._features_dir, self._map_dir = Path(features_dir or files.features), Path(map_dir or files.maps)
         self.settings, paths, _ = how_localized(self._h5)
         self.retrieval = Path(paths[RETRIEVAL]) / f"{self._h5.stem}.jsonl"
@@ -144,7 +79,7 @@ class InspectedPair:
     def __len__(self) -> int:
         return len(self.names)
 
-    def look(self, query: int | str = 0) -> Inspection:
+    def look(self, query: int | str = 0) -> Answer:
         """Return a query with the stored results of the localize stage.
 
         Args:
@@ -158,22 +93,32 @@ class InspectedPair:
         names = self.localized.query_session.image_names
         images = {names[row]: number for number, rows in enumerate(self.localized.rows) for row in rows}
         number = find_query(query, images, len(self))
-        return self._inspection(number, self.localized.results[number], self.settings)
+        context = Located(partial(self._answer, number), partial(self._open, number))
+        return self._answer(number, replace(self.localized.results[number], context=context))
 
-    def localize(self, number: int, changes: Mapping[str, Any]) -> Inspection:
-        """Localize a query again; see `Inspection.again`."""
-        scene_map = self._changed(json.dumps(changes))
-        query, references = self._stored.query(scene_map, self.localized.rows[number])
-        return self._inspection(number, scene_map.locate(query, references=references), scene_map.settings)
+    def _answer(self, number: int, result: QueryResult) -> Answer:
+        pair, true = self.localized, self.localized.true_poses[number]
+        return Answer(
+            *(result, self.settings, *pair.views(number), pair.map_session, pair.local_map, pair.results.unit),
+            true if is_posed(true) else None,
+            f"query {number} of {pair.query_session.device}",
+            number,
+            self._retrieved(number),
+        )
 
-    def _inspection(self, number: int, result: QueryResult, settings: LocalizeSettings) -> Inspection:
-        return Inspection(self.localized, number, result, settings, self._retrieved(number), of=self)
+    def _open(self, number: int) -> tuple[Map, Query, Sequence[References]]:
+        return (self._map, *self._stored.query(self._map, self.localized.rows[number]))
 
     @cached_property
     def _map(self) -> Map:
         """Cached: opening the map takes time."""
         self.localized.results.require_current()
-        return Map.of_pair(self._h5, self.map_device, self._features_dir, self._map_dir)
+        scene_map = Map.of_pair(self._h5, self.map_device, self._features_dir, self._map_dir)
+        if not self._files.embeddings.is_dir():
+            return scene_map
+        # Other references are then retrieved as in the run.
+        reranked = self.retrieval.parent.name == self._files.reranked_dir.name
+        return replace(scene_map, files=self._files, reranked=reranked)
 
     @cached_property
     def _stored(self) -> StoredQueries:
@@ -181,10 +126,6 @@ class InspectedPair:
         if self._map.settings.method not in WITHOUT_FEATURES:
             stored.open_features(self._map)
         return stored
-
-    @lru_cache(maxsize=8)  # noqa: B019 - lives as long as the pair
-    def _changed(self, changes: str) -> Map:
-        return self._map.changed(json.loads(changes))
 
     @cached_property
     def _topk(self) -> dict[tuple[int, str], list[dict[str, Any]]]:
@@ -233,19 +174,25 @@ class WorstQueries:
         self._queries = [queries[k] for k in order]
         self.names = [f"{pair.label}: {shown_name(pair.names[number])}" for pair, number in self._queries]
 
-    def look(self, rank: int | str = 0) -> Inspection:
-        """Return a query by its rank, 0 for the worst of all.
+    def look(self, rank: int | str = 0) -> Answer:
+        """Return a query by its rank, 0 or `worst` for the worst of all, or by the name of one of its images.
+
+        A query that was localized in several maps is returned where it is worst.
 
         Raises:
-            ArtifactError: the rank is out of range.
+            ArtifactError: the rank is out of range; or no query has the name, or several do.
         """
-        if not isinstance(rank, int | np.integer) or not 0 <= rank < len(self.names):
-            raise ArtifactError(f"query: found {rank!r}, expected a rank from 0, the worst, to {len(self.names) - 1}.")
-        pair, number = self._queries[int(rank)]
+        queries = [(pair, number, pair.localized.rows[number]) for pair, number in self._queries]
+        images, first = dict[str, int](), dict[tuple[str, bytes], int]()
+        for at, (pair, _, rows) in enumerate(queries):
+            session = pair.localized.query_session
+            first.setdefault((session.id, rows.tobytes()), at)
+            images |= {session.image_name(row): first[session.id, rows.tobytes()] for row in rows.tolist()}
+        pair, number, _ = queries[find_query(0 if rank == WORST else rank, images, len(queries))]
         return pair.look(number)
 
 
-def inspect_query(run: str | Path, scene: str, map: str, query: str, n: int | str = 0) -> Inspection:  # noqa: A002
+def inspect_query(run: str | Path, scene: str, map: str, query: str, n: int | str = 0) -> Answer:  # noqa: A002
     """Return one query of a finished run with the stored results of the localize stage.
 
     Args:

@@ -15,22 +15,21 @@ from tests.localized import some_correspondences, stored, write_pair
 from tests.rendered import LIST, copy_shared, write_retrieval
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, ManifestError
-from toolkit.figures.answers import _position_covariance, reason_in_words
-from toolkit.figures.inspection import (
-    Choice,
-    Comparison,
-    InspectedPair,
-    WorstQueries,
-    choose,
-    find_query,
-    inspect_query,
-)
+from toolkit.figures.answers import Comparison, reason_in_words
 from toolkit.figures.query_images import shown_name
 from toolkit.files import SceneFiles, map_record_path
 from toolkit.geometry import invert
 from toolkit.localize import localize_pairs
 from toolkit.manifest import LocalizeSettings
 from toolkit.pose.result import CAMERA, QueryResult, Rival, Status
+from toolkit.scene.inspection import (
+    Choice,
+    InspectedPair,
+    WorstQueries,
+    choose,
+    find_query,
+    inspect_query,
+)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +61,7 @@ def written(
     """A pair written by hand, its attributes like those of a run."""
     import h5py
 
-    from toolkit.scene.opening import RETRIEVAL, SESSIONS_ROOT, SETTINGS
+    from toolkit.results.opening import RETRIEVAL, SESSIONS_ROOT, SETTINGS
 
     poses = folder / capture.name / "poses"
     stem = write_pair(Capture.open(capture), poses, "ios", device, queries, **columns)  # type: ignore[arg-type]
@@ -108,30 +107,34 @@ def test_it_shows_what_the_stage_stored(files: SceneFiles, pair: InspectedPair) 
 @pytest.mark.slow
 def test_unchanged_settings_give_the_same_pose_and_others_are_shown_beside(pair: InspectedPair) -> None:
     one = pair.look(0)
-    same = one.again()
+    same = one.result.what_if()
     assert same.after.result.world_from_rig is not None
     np.testing.assert_allclose(same.after.result.world_from_rig, one.result.world_from_rig, atol=1e-12)
     np.testing.assert_allclose(same.after.result.covariance, one.result.covariance, rtol=1e-9)
     assert same.after.result.status_text == one.result.status_text
     assert len(same.after.result.correspondences) == len(one.result.correspondences)
     assert (same.after.result.rivals, one.result.rivals) == ((), ())
-    strict = one.again({"pnp": {"min_inliers": 5000}})
+    strict = one.result.what_if({"localize.pnp.min_inliers": 5000})
     assert strict.after.result.reason.startswith("too few inliers")
     assert "at least 5000 are required" in strict.after.reason
-    assert strict.before is one
+    assert strict.before.result is one.result
     assert strict.table.loc["status"].tolist() == [one.result.status_text, strict.after.result.status_text]
     assert picture_of(strict).width > 800
-    nearest = one.again({"method": "nearest"})
+    nearest = one.result.what_if({"localize": {"method": "nearest"}})
     assert nearest.after.result.found_by == "nearest"
     first = one.references[one.references["rank"] == 1]  # one of each camera of the rig
     assert list(nearest.after.result.references) == [first["name"][first["score"].idxmax()]]
     alone = text_of(nearest.after.figure)
     assert "true position error" in alone
     assert not any(text in alone for text in ("inliers", "descriptor matches", "image covered")), "it has none"
-    with pytest.raises(ManifestError, match=r"max_keypoints|features: found other settings"):
-        one.again({"features": {"max_keypoints": 500}})
-    with pytest.raises(ManifestError, match="min_inliers"):
-        one.again({"pnp": {"min_inlier": 5}})
+    with pytest.raises(ManifestError, match=r"min_inliers"):
+        one.result.what_if({"localize.pnp.min_inlier": 5})
+    with pytest.raises(ManifestError, match=r"--set localize.unit"):
+        one.result.what_if({"localize.unit": None})
+    with pytest.raises(ManifestError, match=r"embed.*retrieve.topk"):
+        one.result.what_if({"embed.models": "vlad"})
+    with pytest.raises(ManifestError, match=r"topk"):
+        one.result.what_if({"retrieve.topk": 0})
 
 
 def test_the_worst_is_the_worst(small_capture: Path, tmp_path: Path) -> None:
@@ -185,16 +188,13 @@ def test_rivals_are_drawn_where_they_are(small_capture: Path, tmp_path: Path) ->
 
 def test_the_ellipse_is_of_the_camera_not_of_the_rig(pair: InspectedPair) -> None:
     one = pair.look(0)
-    rig_from_cam = one.pair.query_session.rig_from_cam(one.pair.rows[0])
-    names = [one.pair.query_session.image_name(int(row)) for row in one.pair.rows[0]]
-    camera = names.index(one.details.cameras[0].name)
+    camera = [view.name for view in one.views].index(one.details.cameras[0].name)
     rng = np.random.default_rng(0)
     moves = rng.multivariate_normal(np.zeros(6), one.result.covariance, 20_000)
-    at = rig_from_cam[camera][:3, 3]
+    at = one.rig_from_cams[camera][:3, 3]
     places = at + moves[:, 3:] + np.cross(moves[:, :3], at)
     expected = np.cov((places @ one.result.world_from_rig[:3, :3].T).T)
-    covariance = _position_covariance(one, rig_from_cam[camera])
-    np.testing.assert_allclose(covariance, expected, atol=0.05 * np.abs(expected).max())
+    np.testing.assert_allclose(one.details.position_covariance, expected, atol=0.05 * np.abs(expected).max())
 
 
 def test_both_answers_are_drawn_at_the_same_camera_of_a_rig(pair: InspectedPair) -> None:
@@ -243,7 +243,7 @@ def test_names_and_numbers_that_are_none_are_refused(files: SceneFiles, pair: In
         pair.look(len(pair))
     with pytest.raises(ArtifactError, match=r"expected a number or the name of an image"):
         pair.look(1.5)  # type: ignore[arg-type]
-    with pytest.raises(ArtifactError, match="2 queries have an image name that ends in"):
+    with pytest.raises(ArtifactError, match="2 have an image name that ends in"):
         find_query("b.jpg", {"x/b.jpg": 0, "y/b.jpg": 1, "y/ab.jpg": 2}, 3)
     with pytest.raises(ArtifactError, match=r"no correspondences of queries of 'spt'.*Did you mean .*spot"):
         inspect_query(files.run, files.scene, "ios", "spt", 0)
@@ -292,12 +292,12 @@ def test_a_list_chooses_what_is_shown(pair: InspectedPair, monkeypatch: pytest.M
     monkeypatch.setenv(TEXT_BARS, "1")
     outputs.clear()
     choose(pair, pair.names[0])
-    assert [type(shown).__name__ for shown in outputs] == ["Inspection"]
+    assert [type(shown).__name__ for shown in outputs] == ["Answer"]
 
 
 def test_asking_in_a_notebook_does_not_end_it(
     capsys: pytest.CaptureFixture[str], pair: InspectedPair
 ) -> None:
-    Choice(pair.look(0)).attempt(lambda query: query.again({"features": {"max_keypoints": 5}}))
-    assert "features" in capsys.readouterr().out
+    Choice(pair.look(0)).attempt(lambda query: query.result.what_if({"localize.unit": None}))
+    assert "unit" in capsys.readouterr().out
     Choice(None).attempt(lambda query: pytest.fail("there is none"))
