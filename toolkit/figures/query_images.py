@@ -28,7 +28,7 @@ MARKERS = {"": "o", "sift": "o", "aliked": "^", "superpoint": "s"}
 MAX_LINES = 60
 """Lines drawn for correspondences that agree, and for rejected ones: more would hide the images."""
 MAX_SHOWN = 8
-"""References of an image that `draw_references` draws."""
+"""References of an image that `draw_query_and_references` draws."""
 MAX_LETTERS = 60
 """Letters of an image name on the sheet of the worst queries: more would run into the next image."""
 
@@ -155,7 +155,7 @@ def draw_pair(query: ShownImage, reference: ShownImage, title: str) -> "Figure":
 
 
 @styled
-def draw_references(
+def draw_query_and_references(
     images: Sequence[Path | NDArray[np.uint8]], references: Sequence[Sequence[tuple[Path, float]]]
 ) -> "Figure":
     """Draw the images of a query, one per row, each beside its references, with their ranks and scores.

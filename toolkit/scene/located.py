@@ -42,11 +42,11 @@ class Retrieved(list[References]):
         return [self._map.localizer.image_names[index] for index in self[image].images]
 
     def _repr_mimebundle_(self, **_: Any) -> dict[str, bytes]:
-        from toolkit.figures.query_images import draw_references
+        from toolkit.figures.query_images import draw_query_and_references
         from toolkit.figures.style import shown
 
         of_query = [self._paths(image) for image in range(len(self))]
-        return shown(draw_references([view.image for view in self._query.views], of_query))
+        return shown(draw_query_and_references([view.image for view in self._query.views], of_query))
 
     def _paths(self, image: int) -> list[tuple[Any, float]]:
         files = map(self._map.capture.image_path, self.names(image))
