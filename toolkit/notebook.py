@@ -36,7 +36,7 @@ from toolkit.manifest import (
     nearest,
 )
 from toolkit.manifest.messages import explain
-from toolkit.runs.folder import LOG_VARIABLE, RECORD, log_to
+from toolkit.runs.folder import LOG_VARIABLE, RECORD, counts_text, log_to
 from toolkit.runs.kernel import TEXT_BARS, Kernels, MemoryWatch, kernel_error
 from toolkit.runs.pairs import left_out_of
 
@@ -210,8 +210,7 @@ def finish(table: "pd.DataFrame | None" = None, **counts: Any) -> None:
     unit = 2**20 if sys.platform == "darwin" else 2**10  # bytes on macOS, kilobytes elsewhere
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
     plain = {name: value.item() if hasattr(value, "item") else value for name, value in counts.items()}
-    text = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in plain.items())
-    text += f"; peak memory {peak:.0f} MB"
+    text = f"{counts_text(plain)}; peak memory {peak:.0f} MB"
     content = {**plain, "peak_memory_mb": round(peak, 1)}
     if table is not None:
         content |= {"asked": len(table), "left_out": left_out_of(table)}
