@@ -429,8 +429,9 @@ def check_values(name: str, values: Mapping[str, Any]) -> None:
             if key in of_stage:  # with those before it, because a matcher must fit the features
                 stage_settings(name, given)
                 continue
-            field = (_TYPES.get(key, _type_of(defaults[key])), Field(description=f"{meanings.get(key)}."))
-            model = create_model(path.stem, __config__=ConfigDict(strict=True), **{key: field})
+            type_of_key, meaning = _TYPES.get(key, _type_of(defaults[key])), f"{meanings.get(key)}."
+            fields: dict[str, Any] = {key: (type_of_key, Field(description=meaning))}
+            model = create_model(path.stem, __config__=ConfigDict(strict=True), **fields)
             model.model_validate({key: values[key]})
         except ValidationError as error:
             raise _of_parameter(key, explain(error, model, path.name)) from None

@@ -87,7 +87,8 @@ def test_the_method_is_told_from_the_settings_of_the_results(tmp_path: Path) -> 
         (folder / "settings.json").write_text(settings.model_dump_json())
     text = review.method(files, reranked=True)
     for said in ("the 30 map images", "(MegaLoc and VLAD of RootSIFT)", "limited by GPS.", "keeps the 7",
-                 "SIFT features", "localized again with ALIKED", "at least 15 inliers", "99 % or more"):  # fmt: skip
+                 "SIFT features", "localized again with ALIKED", "at least 15 inliers",
+                 "is 99\N{NO-BREAK SPACE}% or more"):  # fmt: skip
         assert said in text
     assert "keeps the 7" not in review.method(files, reranked=False)
     others = {"nearest": "of its first reference", "feed_forward": "VGGT predicts", "hybrid": "guide further matching"}

@@ -45,6 +45,8 @@ WORST, MAX_REASONS = 10, 12
 """Rows listed for a scene: the worst queries, and the reasons why queries have no pose."""
 OK_WRONG = "ok but wrong"
 CAPTION = "Every pair: recall with its 95 % interval, median errors, and time per query"
+MAX_STATUS = 70
+"""Letters of a status that are shown; the tables of the poses have all of it."""
 LONG = 30
 """Letters from which the text of a table is wrapped."""
 LINKED = {
@@ -174,7 +176,7 @@ def _summary(run: dict[str, Any]) -> list[tuple[str, str]]:
         parts.append(("peak memory", f"{run['peak_memory_mb'] / 1000:.2f} GB"))
     # The page lists Python's version with the other versions.
     machine = {key: value for key, value in run["machine"].items() if key != "python"}
-    texts = {"cores": "{} cores", "memory_gb": "{} GB", "gpu": "GPU: {}"}
+    texts = {"cores": "{} cores", "memory_gb": "{} GB of memory", "gpu": "GPU: {}"}
     shown = ", ".join(texts.get(key, "{}").format(value) for key, value in machine.items())
     return [*parts, ("machine", shown), ("git commit", run["commit"])]
 
@@ -413,7 +415,7 @@ def _named(table: pd.DataFrame, thresholds: list[str]) -> tuple[pd.DataFrame, di
     formats: dict[str, Write] = {"median error [°]": number}
     formats |= {f"median error [{small}]": lambda length: number(factor * length)}
     formats |= dict.fromkeys(shares.values(), _recall)
-    formats |= {OK_WRONG: _share, **dict.fromkeys(["time, median [s]", "time, 95 % [s]"], number)}
+    formats |= {OK_WRONG: _unshaded, **dict.fromkeys(["time, median [s]", "time, 95 % [s]"], number)}
     return table.rename(columns=names), formats
 
 
@@ -529,12 +531,17 @@ def _listed(queries: pd.DataFrame, caption: str, unit: str) -> Markup:
         rows, names = queries.to_dict("records"), {}
         table["off by"] = [off_by(row, unit=unit) for row in rows]
         table["why"] = [_why(row) for row in rows]
-    table["status"], table["inliers"] = queries["status"].str.replace("_", " "), queries["num_inliers"]
-    table["image"] = queries["image"].fillna("").map(_shown_names)
+    table["status"] = queries["status"].str.replace("low_confidence", "low confidence").map(_shortened)
+    table["inliers"] = queries["num_inliers"]
     names |= {"p_correct": "stated to be right", "rival_support": "support of a rival"}
     known = queries.filter([*names]).dropna(axis="columns", how="all").rename(columns=names)
-    formats = dict.fromkeys(["stated to be right", "support of a rival"], _share)
-    return _table(table.join(known), caption, formats)
+    formats: dict[str, Write] = dict.fromkeys(["stated to be right", "support of a rival"], _unshaded)
+    names_of_images = queries["image"].fillna("").map(_shown_names)
+    return _table(table.join(known).assign(image=names_of_images), caption, formats)
+
+
+def _shortened(status: str) -> str:
+    return status if len(status) <= MAX_STATUS else f"{status[:MAX_STATUS]} …"
 
 
 def _queries(table: pd.DataFrame) -> "pd.Series[str]":
@@ -604,6 +611,10 @@ def _natural(path: Path) -> list[Any]:
 
 def _share(share: float) -> str:
     return f"{percent(share)}\N{NO-BREAK SPACE}%"
+
+
+def _unshaded(share: float) -> str:
+    return _share(share)
 
 
 def _length(length: float, unit: str) -> str:

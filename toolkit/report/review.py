@@ -52,7 +52,7 @@ def main_table(recall: pd.DataFrame, queries: pd.DataFrame, thresholds: Sequence
         thresholds: columns of recall. Each gets `<column>_low` and `<column>_high`, the Wilson interval (E. B. Wilson,
             JASA 22, 1927; L. Brown et al., Statistical Science 16, 2001, recommend it), as if queries were independent.
     """
-    of_pair = queries.groupby(PAIR, sort=False) if len(queries) else []
+    of_pair = queries.reindex(columns=[*PAIR, "status", "seconds"]).astype({"seconds": float}).groupby(PAIR, sort=False)
     if recall.empty:
         counts = {pair: {"queries": len(rows), **status_counts(rows["status"])} for pair, rows in of_pair}
         recall = pd.DataFrame.from_dict(counts, "index").rename_axis(PAIR).reset_index() if counts else recall
@@ -65,14 +65,13 @@ def main_table(recall: pd.DataFrame, queries: pd.DataFrame, thresholds: Sequence
         table[[f"{name}_low", f"{name}_high"]] = intervals
     rest = ["median_rotation_deg", "median_translation_m", "ok_wrong"]
     table = table.join(recall[[name for name in rest if name in recall]])
-    if len(queries):
-        seconds = {f"seconds_{name}": of_pair["seconds"].quantile(q) for name, q in (("median", 0.5), ("95", 0.95))}
-        table = table.join(pd.DataFrame(seconds), on=PAIR)
+    seconds = {f"seconds_{name}": of_pair["seconds"].quantile(q) for name, q in (("median", 0.5), ("95", 0.95))}
+    table = table.join(pd.DataFrame(seconds), on=PAIR)
     return table.join(recall[[name for name in (*COUNTS, "state") if name in recall]])
 
 
 def readable(table: pd.DataFrame, thresholds: Sequence[str]) -> pd.DataFrame:
-    """Return the main table with the columns of a page: recall and its interval in one, and short names."""
+    """Return the main table with the columns of a page: recall and its interval in one, none that is empty."""
     shown = table.copy()
     for name in thresholds:
         rows = table[[name, f"{name}_low", f"{name}_high"]].to_numpy(float)
@@ -80,7 +79,7 @@ def readable(table: pd.DataFrame, thresholds: Sequence[str]) -> pd.DataFrame:
         shown = shown.drop(columns=[f"{name}_low", f"{name}_high"])
     if "state" in shown and (shown["state"] == "evaluated").all():
         shown = shown.drop(columns="state")
-    return shown.replace({"state": {"evaluated": ""}})
+    return shown.replace({"state": {"evaluated": ""}}).dropna(axis="columns", how="all")
 
 
 def write_tables(stem: Path, table: pd.DataFrame, shown: pd.DataFrame, caption: str) -> list[Path]:
@@ -175,8 +174,9 @@ def _localization(settings: LocalizeSettings) -> list[str]:
     if features.escalation:
         kinds = _listed(NAMES.get(kind, kind) for kind in features.escalation)
         said.append(f"A query that is not sure is localized again with {kinds} as well.")
-    said.append(f"A pose with at least {pnp.min_inliers} inliers is kept; it is called ok if its estimated probability "
-                f"of being within 5° and 0.5 m is {percent(pnp.ok_probability)} % or more.")  # fmt: skip
+    said.append(f"A pose with at least {pnp.min_inliers} inliers is kept; it is called ok if the estimated probability "
+                f"that it is right to within 5° and 0.5 m is {percent(pnp.ok_probability)}\N{NO-BREAK SPACE}% "
+                "or more.")  # fmt: skip
     return said
 
 
