@@ -71,7 +71,7 @@ def result(run: Path, sessions_root: Path) -> bytes:
 
 def report(browser: "Browser", run: Path) -> bytes:
     """Return a picture of the report's tables, without its head, which has times of this machine."""
-    page = browser.new_page(viewport={"width": 1000, "height": 1150})
+    page = browser.new_page(viewport={"width": 1240, "height": 1000})
     page.goto((run / "report.html").as_uri() + "#scene-1")
     return page.screenshot()
 

@@ -3,6 +3,7 @@
 import importlib
 import inspect
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -15,9 +16,10 @@ import pandas as pd
 import pytest
 
 from toolkit import notebook, pipeline
-from toolkit.errors import ManifestError
+from toolkit.errors import ManifestError, StageError
 from toolkit.manifest import OPTIONAL, STAGES, Manifest, RetrieveSettings
 from toolkit.notebook import notebook_parameters, notebook_path
+from toolkit.runs.folder import LOG_VARIABLE
 
 # What the pipeline sets for a run, so that a manifest has it once and not in a section.
 OF_THE_RUN = {
@@ -89,6 +91,53 @@ def test_a_stage_gets_the_parameters_of_its_notebook_and_then_its_dict(monkeypat
     names["settings"] = {"topk": "many"}
     with pytest.raises(ManifestError, match=r"topk: found 'many'"):
         folders.settings  # noqa: B018
+
+
+@pytest.mark.parametrize("name", [*STAGES, "own_images", "compare"])
+def test_a_wrong_parameter_is_named_as_in_its_cell(name: str) -> None:
+    """In one line, whatever the path of its setting in the tree is, and however many types it may have."""
+    parameters = notebook_parameters(notebook_path(name))
+    for key, default in parameters.items():
+        may_be_none = default is None or key in ("settings", "unit_m", "features", "matcher", "predictor")
+        for wrong in ({"nonsense": 1}, [[["nonsense"]]], *([] if isinstance(default, float) else [3.5]), None):
+            if wrong is None and may_be_none:
+                continue
+            with pytest.raises(ManifestError, match=rf"^{key}: ") as caught:
+                notebook.check_values(name, parameters | {key: wrong})
+            assert not re.search(r"\n|Settings:|lax-or-strict", str(caught.value))
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "named"),
+    [
+        ("localize", {"features": 3}, r"^features: found 3\. .* Meaning: Kinds of local features"),
+        ("localize", {"features": ["sift"], "matcher": "mutuel"}, r"^matcher: .*'mutuel'. Did you mean 'mutual'"),
+        ("localize", {"settings": {"pnp": {"min_inliers": "x"}}}, r"^settings: pnp\.min_inliers: found 'x'"),
+        ("embed", {"device": 3}, r"^device: found 3\. .* a valid list or a valid string\. Meaning: one of"),
+        ("own_images", {"poses_are": "cam"}, r"^poses_are: found 'cam'\. .*Known: cam_from_world, world_from_cam"),
+        ("own_images", {"map_images": 3}, r"^map_images: found 3\. .* Meaning: folder of your map images"),
+    ],
+)
+def test_what_a_wrong_parameter_means_is_said(name: str, wrong: dict[str, Any], named: str) -> None:
+    with pytest.raises(ManifestError, match=named):
+        notebook.check_values(name, wrong)
+
+
+@pytest.mark.slow
+def test_an_error_of_the_user_is_a_sentence_in_the_notebook_and_a_traceback_in_the_log(
+    small_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(LOG_VARIABLE, str(tmp_path / "run.log"))
+    parameters = {"sessions_root": str(small_capture / "sessions"), "query_device": "drone"}
+    with pytest.raises(StageError, match=r"^query_device: No query session of device 'drone'"):
+        notebook.execute(notebook_path("retrieve"), tmp_path / "out.ipynb", parameters)
+    cells = nbformat.read(tmp_path / "out.ipynb", as_version=4).cells
+    (shown,) = [o for cell in cells for o in cell.get("outputs", []) if o.output_type == "error"]
+    assert shown.ename == "CaptureError"
+    assert "query_device: No query session" in shown.traceback[0]
+    assert len(shown.traceback) == 2
+    assert "notebook.start(" in shown.traceback[1]
+    assert "in _check_devices_and_queries" in (tmp_path / "run.log").read_text()
 
 
 @pytest.mark.parametrize("stage", FUNCTIONS)

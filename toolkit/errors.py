@@ -5,6 +5,8 @@ import logging
 import os
 import re
 import signal
+import traceback
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, Self
 
@@ -33,6 +35,20 @@ class ToolkitError(Exception):
         parts = [f"found {found}" if found else "", f"expected {expected}" if expected else ""]
         said = ", ".join(part for part in parts if part)
         return cls(f"{place}: " + " ".join(text for text in (said and f"{said}.", do) if text))
+
+    def _render_traceback_(self) -> list[str]:
+        """Return what IPython shows of the error: its message, and the user's lines that led into the toolkit.
+
+        The traceback goes to the log of a run. In a notebook, `traceback.print_last()` prints it.
+        """
+        log.debug("an error in a notebook", exc_info=self)
+        frames, toolkit = traceback.extract_tb(self.__traceback__), str(Path(__file__).parent)
+        lines = [
+            f"  {frame.filename if Path(frame.filename).is_file() else 'cell'}, line {frame.lineno}: {frame.line}"
+            for frame in takewhile(lambda frame: not frame.filename.startswith(toolkit), frames)
+            if "site-packages" not in frame.filename  # IPython's own
+        ]
+        return [f"\x1b[31m{type(self).__name__}\x1b[0m: {self}", *lines]
 
 
 class CaptureError(ToolkitError):

@@ -11,18 +11,18 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tqdm.auto
 import tqdm.std
-from pydantic import ConfigDict, Field, NonNegativeInt, ValidationError, create_model
+from pydantic import BeforeValidator, ConfigDict, Field, NonNegativeInt, ValidationError, create_model
 
 from toolkit import errors
-from toolkit.errors import ManifestError, StageError, shortage
+from toolkit.errors import CaptureError, ManifestError, StageError, shortage
 from toolkit.files import SceneFiles, link_folder, older_files, read_json, write_text
 from toolkit.manifest import (
     OPTIONAL,
@@ -36,7 +36,7 @@ from toolkit.manifest import (
     nearest,
 )
 from toolkit.manifest.messages import explain
-from toolkit.runs.folder import LOG_VARIABLE, RECORD, log_to
+from toolkit.runs.folder import LOG_VARIABLE, RECORD, counts_text, log_to
 from toolkit.runs.kernel import TEXT_BARS, Kernels, MemoryWatch, kernel_error
 from toolkit.runs.pairs import left_out_of
 
@@ -87,6 +87,7 @@ class Folders(SimpleNamespace):
     @property
     def settings(self) -> Any:
         """The settings model of the stage, from the notebook's parameters as they are now."""
+        check_values(self._stage, _user_names())
         return stage_settings(self._stage, _user_names())
 
     def __repr__(self) -> str:
@@ -209,8 +210,7 @@ def finish(table: "pd.DataFrame | None" = None, **counts: Any) -> None:
     unit = 2**20 if sys.platform == "darwin" else 2**10  # bytes on macOS, kilobytes elsewhere
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
     plain = {name: value.item() if hasattr(value, "item") else value for name, value in counts.items()}
-    text = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in plain.items())
-    text += f"; peak memory {peak:.0f} MB"
+    text = f"{counts_text(plain)}; peak memory {peak:.0f} MB"
     content = {**plain, "peak_memory_mb": round(peak, 1)}
     if table is not None:
         content |= {"asked": len(table), "left_out": left_out_of(table)}
@@ -233,13 +233,18 @@ def notebook_parameters(path: Path) -> dict[str, Any]:
     Raises:
         ManifestError: there is no such cell, or it contains more than `name = literal` lines.
     """
+    try:
+        return _literals(_listing(path))
+    except (SyntaxError, ValueError) as error:
+        raise ManifestError(f"{path}: parameters must be `name = literal` lines only ({error}).") from None
+
+
+def _listing(path: Path) -> str:
+    """Return the cell tagged `parameters` of a notebook."""
     # Read as JSON, because importing nbformat takes seconds in each kernel.
     for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
         if "parameters" in cell["metadata"].get("tags", []):
-            try:
-                return _literals("".join(cell["source"]))
-            except (SyntaxError, ValueError) as error:
-                raise ManifestError(f"{path}: parameters must be `name = literal` lines only ({error}).") from None
+            return "".join(cell["source"])
     raise ManifestError(f"{path}: no cell is tagged `parameters`.")
 
 
@@ -352,14 +357,25 @@ def _check_devices_and_queries(stage: str, sessions: Path) -> None:
 
     values, known = _user_names(), notebook_parameters(notebook_path(stage))
     asked = {name: values[name] for name in known if name in values}
-    capture = Capture.from_sessions_root(sessions) if asked else None
-    for name, split in (("map_device", "map"), ("query_device", "query")):
-        if capture and name in asked:
-            capture.devices_with(split, asked[name])
-    if capture and "queries" in asked and asked["queries"] != "all" and (recorded := capture.usable("query")):
-        short = str(asked["queries"]).removesuffix(".txt").removeprefix("keyframes_")
-        if not any(short in session.keyframe_files for session in recorded):
-            recorded[0].keyframes(asked["queries"])  # raises the error
+    if not asked:
+        return
+    name = "sessions_root"
+    try:
+        capture = Capture.from_sessions_root(sessions)
+        for pair in asked.get("pairs") or ():
+            if not {*pair} <= {*capture.devices}:
+                expected = f"[map device, query device] of {', '.join(capture.devices)}"
+                raise ManifestError.at("pairs", f"{pair}", expected)
+        for name, split in (("map_device", "map"), ("query_device", "query")):
+            if name in asked:
+                capture.devices_with(split, asked[name])
+        name = "queries"
+        if asked.get(name, "all") != "all" and (recorded := capture.usable("query")):
+            short = str(asked[name]).removesuffix(".txt").removeprefix("keyframes_")
+            if not any(short in session.keyframe_files for session in recorded):
+                recorded[0].keyframes(asked[name])  # raises the error
+    except CaptureError as error:
+        raise CaptureError(f"{name}: {error}") from None
 
 
 def stage_settings(stage: str, values: Mapping[str, Any]) -> Settings:
@@ -402,25 +418,41 @@ def check_values(name: str, values: Mapping[str, Any]) -> None:
         values: values by name; names that are no parameters of the notebook are ignored.
 
     Raises:
-        ManifestError: names the parameter, what was found and what was expected.
+        ManifestError: names the first wrong parameter, what was found, what was expected, and what it means.
     """
-    path = notebook_path(name)
-    checked = {"settings", *type(stage_settings(name, values)).model_fields} if name in STAGES else set()
-    defaults = {key: value for key, value in notebook_parameters(path).items() if key not in checked and key in values}
-    fields: dict[str, Any] = {key: (_TYPES.get(key, _type_of(value)), ...) for key, value in defaults.items()}
-    model = create_model(path.stem, __config__=ConfigDict(strict=True), **fields)
-    try:
-        model.model_validate({key: values[key] for key in fields})
-    except ValidationError as error:
-        raise ManifestError(explain(error, model, path.name)) from None
+    path, given = notebook_path(name), dict[str, Any]()
+    defaults, meanings = notebook_parameters(path), dict(re.findall(r"^(\w+) = .*  # (.+)", _listing(path), re.M))
+    of_stage = {"settings", *type(Manifest.defaults(name)).model_fields} if name in STAGES else set()
+    for key in [key for key in defaults if key in values]:
+        given[key] = values[key]
+        try:
+            if key in of_stage:  # with those before it, because a matcher must fit the features
+                stage_settings(name, given)
+                continue
+            type_of_key, meaning = _TYPES.get(key, _type_of(defaults[key])), f"{meanings.get(key)}."
+            fields: dict[str, Any] = {key: (type_of_key, Field(description=meaning))}
+            model = create_model(path.stem, __config__=ConfigDict(strict=True), **fields)
+            model.model_validate({key: values[key]})
+        except ValidationError as error:
+            raise _of_parameter(key, explain(error, model, path.name)) from None
+        except ManifestError as error:
+            raise _of_parameter(key, str(error)) from None
 
 
-Pair = Annotated[Sequence[str], Field(min_length=2, max_length=2)]
+def _of_parameter(key: str, text: str) -> ManifestError:
+    """Return an error that names the parameter of a notebook, without the class and the path of its setting."""
+    lines = [re.sub(rf"^(\w+Settings|{key}[\w.]*): ", "", line) for line in text.split("\n  ")]
+    return ManifestError(f"{key}: " + "\n  ".join(lines[1:] or lines))
+
+
+Folder = Annotated[str, BeforeValidator(lambda path: str(path) if isinstance(path, Path) else path)]
+Pair = Annotated[list[str], Field(min_length=2, max_length=2, strict=False)]  # or a tuple
 _TYPES: dict[str, Any] = {
     "device": str | list[str],
     "inspect": int | str,
-    "pairs": Sequence[Pair] | None,
-    "runs": Sequence[str | Path] | None,
+    "pairs": Annotated[list[Pair], Field(strict=False)] | None,
+    "poses_are": Literal["world_from_cam", "cam_from_world"],
+    "runs": Annotated[list[Folder], Field(strict=False)] | None,
     "unit_m": float | None,
 }
 """Types of parameters that are not those of their defaults."""
@@ -428,7 +460,7 @@ _TYPES: dict[str, Any] = {
 
 def _type_of(default: Any) -> Any:
     """Return the type of a parameter, by its default: a folder if that is None; numbers are not negative."""
-    return str | Path | None if default is None else NonNegativeInt if type(default) is int else type(default)
+    return Folder | None if default is None else NonNegativeInt if type(default) is int else type(default)
 
 
 def _literals(source: str) -> dict[str, Any]:

@@ -61,7 +61,7 @@ from toolkit.notebook import (
 )
 from toolkit.prediction.architectures import ARCHITECTURES
 from toolkit.runs.cluster import open_cluster
-from toolkit.runs.folder import LOG, OLDER, RunLog, failures, held, warnings_of_kernels
+from toolkit.runs.folder import LOG, OLDER, RunLog, counts_text, failures, held, warnings_of_kernels
 from toolkit.runs.kernel import Kernels
 from toolkit.runs.sweep import changed_keys, swept_runs, take_over, variant_name
 from toolkit.sequences.pose_graph import require_gtsam
@@ -518,8 +518,8 @@ def _run_job(job: Job, inputs: str, head: str, record: RunLog, say: Say, kernels
     row |= {"work_seconds": round(work, 2), "peak_memory_mb": round(memory), "counts": counts}
     made = {"made": datetime.now(UTC).isoformat(), "inputs": inputs, "outputs": job.outputs(), "row": row}
     write_text(job.record, json.dumps(made, indent=1) + "\n")
-    summary = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in counts.items())
-    line.end(f"{summary}{summary and '; '}{work:.1f} s + {seconds - work:.1f} s start-up, {memory:.0f} MB")
+    took = f"{work:.1f} s + {seconds - work:.1f} s start-up, {memory:.0f} MB"
+    line.end(f"{counts_text(counts)}; {took}" if counts else took)
     for one in row.get("left_out", ()):
         say(f"  left out: {one['what']}: {one['reason']}")
     warnings = [one for one in warnings_of_kernels(job.files.run / LOG, logged) if one not in record.shown]

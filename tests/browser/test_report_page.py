@@ -42,10 +42,26 @@ def test_report_answers_in_the_first_screen(browser: "Browser", finished_run: Pa
     context = browser.new_context(viewport={"width": DESK[0], "height": DESK[1]}, java_script_enabled=False)
     page = context.new_page()
     page.goto((finished_run / "report.html").as_uri())
-    for text in ("small", "done", "mean recall at 1°", "Recall at 1°", "queries in 9 pairs", "good reference"):
+    for text in ("small", "done", "mean recall at 1°", "95 % interval", "queries in 9 pairs", "good reference"):
         box = page.get_by_text(text).first.bounding_box()
         assert box is not None, text
         assert box["y"] + box["height"] <= DESK[1], text
+    context.close()
+
+
+def test_a_picture_enlarges_without_a_script(browser: "Browser", finished_run: Path) -> None:
+    context = browser.new_context(viewport={"width": PHONE[0], "height": PHONE[1]}, java_script_enabled=False)
+    page = context.new_page()
+    page.goto((finished_run / "report.html").as_uri())
+    picture = page.locator(".zoom img").first
+    widths = []
+    for _ in range(3):
+        box = picture.bounding_box()
+        assert box is not None
+        widths.append(box["width"])
+        picture.click(position={"x": 10, "y": 10})
+    assert widths[0] <= PHONE[0] < widths[1], "the picture itself"
+    assert widths[2] == widths[0], "and back"
     context.close()
 
 

@@ -13,7 +13,8 @@ import pytest
 
 from toolkit.errors import ToolkitError
 from toolkit.files import is_left_over, process_tag, write_atomic
-from toolkit.runs.folder import LOG, held, log_to, warnings_of_kernels
+from toolkit.runs import folder
+from toolkit.runs.folder import LOG, counted, counts_text, held, log_to, warnings_of_kernels
 
 
 @pytest.fixture(scope="module")
@@ -106,3 +107,32 @@ def test_the_log_has_times_and_debug_messages_and_the_terminal_warnings_alone(tm
     ]  # fmt: skip
     assert lines[0].startswith("20")
     assert logging.getLogger("toolkit").level == logging.NOTSET
+
+
+def test_one_is_singular() -> None:
+    assert [counted(n, "pairs of devices") for n in (0, 1, 2)] == [
+        "0 pairs of devices", "1 pair of devices", "2 pairs of devices",
+    ]  # fmt: skip
+    assert counts_text({"query_images": 1, "queries": 1, "ok": 1, "inconsistent_maps": 2}) == (
+        "1 query image, 1 query, 1 ok, 2 inconsistent maps"
+    )
+
+
+def test_the_record_names_the_machine_and_the_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = folder.machine()
+    assert list(machine) == ["cpu", "cores", "memory_gb", "gpu", "platform"]
+    assert all(machine.values())
+    assert machine["memory_gb"] > 0.1
+    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b", "-C", str(tmp_path)]
+    source = tmp_path / "toolkit" / "runs" / "folder.py"
+    source.parent.mkdir(parents=True)
+    source.write_text("")
+    monkeypatch.setattr(folder, "__file__", str(source))
+    commit = folder.commit.__wrapped__
+    assert commit() == "", "no repository"
+    for command in (["init", "-q"], ["add", "."], ["commit", "-qm", "first"]):
+        subprocess.run([*git, *command], check=True)
+    head = subprocess.run([*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True).stdout
+    assert commit() == head[:12]
+    source.write_text("changed")
+    assert commit() == f"{head[:12]}-dirty"

@@ -7,7 +7,7 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
-_BRANCH = r"literal|str$|list\[|dict\[|constrained"
+_BRANCH = r"literal|int$|str$|list\[|dict\[|constrained"
 """Names that pydantic adds to the path of a key whose value may have several types."""
 
 
@@ -34,7 +34,7 @@ def explain(
         source: name of the validated file or class, for the first line.
         origin: maps the keys of a value to a suffix that says where the value comes from.
     """
-    lines = []
+    lines = list[str]()
     for problem in error.errors():
         path = [str(key) for key in problem["loc"]]
         keys = [key for key in path if not re.match(_BRANCH, key)]
@@ -55,6 +55,10 @@ def explain(
             line = f"{where}: not given. {problem['msg']}."
         else:
             line = f"{where}: found {problem['input']!r}. {_expected(problem, model, keys)}"
+            if lines and lines[-1].startswith(f"{where}: found {problem['input']!r}. Input should be "):
+                # Another type that the value may have.
+                lines[-1] = lines[-1].replace(" Input should be", f" {problem['msg']} or", 1)
+                continue
         lines.append(line + origin(keys))
     return "\n  ".join([f"{source}:", *dict.fromkeys(lines)])
 
@@ -70,7 +74,7 @@ def _why_unknown(name: str, model: type[BaseModel]) -> str:
 def _expected(problem: Any, model: type[BaseModel], keys: list[str]) -> str:
     """Return what pydantic expected and the description of the setting; only the description instead of a regex."""
     fields = _model_at(model, keys[:-1]).model_fields
-    meaning = fields[keys[-1]].description if keys and keys[-1] in fields else None
+    meaning = " ".join((fields[keys[-1]].description or "").split()) if keys and keys[-1] in fields else ""
     expected = "" if meaning and problem["type"] == "string_pattern_mismatch" else f"{problem['msg']}."
     return f"{expected} Meaning: {meaning}".strip() if meaning else expected
 

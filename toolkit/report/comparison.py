@@ -330,7 +330,7 @@ def readable(comparison: Comparison) -> dict[str, pd.DataFrame]:
     """Return the tables as texts: `recall`, `changes`, `resources`, `settings` and `origins`; some may be empty."""
     origins = {
         name: {"folder": str(folder), "created": record["created"], "code": record["code"] or "not known",
-               "cores": record["machine"].get("cores", "?"), **record["versions"]}
+               "commit": record["commit"], **record["machine"], **record["versions"]}
         for name, folder, record in zip(comparison.names, comparison.folders, comparison.records, strict=True)
     }  # fmt: skip
     seconds, memory_mb = comparison.resources["seconds"], comparison.resources["memory_mb"]

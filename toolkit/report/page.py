@@ -29,8 +29,11 @@ from toolkit.files import (
     write_text,
 )
 from toolkit.pose.result import Status, status_counts, statuses
+from toolkit.report import review
+from toolkit.report.review import Interval
 from toolkit.results import metrics
 from toolkit.results.pair import PairResults, pairs_of
+from toolkit.runs.folder import counted, counts_text
 
 Write = Callable[[Any], str]
 """Function that writes a number of a table."""
@@ -40,6 +43,10 @@ MAX_WIDTH = 1600
 """Width of an embedded picture, pixels, at most."""
 WORST, MAX_REASONS = 10, 12
 """Rows listed for a scene: the worst queries, and the reasons why queries have no pose."""
+OK_WRONG = "ok but wrong"
+CAPTION = "Every pair: recall with its 95 % interval, median errors, and time per query"
+MAX_STATUS = 70
+"""Letters of a status that are shown; the tables of the poses have all of it."""
 LONG = 30
 """Letters from which the text of a table is wrapped."""
 LINKED = {
@@ -87,17 +94,16 @@ class Picture:
     caption: str
     path: str
     """Relative to the run folder."""
-    wide: bool = False
-    """Too wide to be readable when scaled to a phone."""
 
 
 def write_report(run_dir: str | Path) -> Path:
     """Write `report.html` from the `run.json`, tables and pictures of a run folder, and return its path.
 
-    Pictures are embedded, so the file can be mailed alone. Links to poses, notebooks and recordings are relative to
-    the run folder. The report leaves out missing files and names unreadable ones. It shows the pictures in the folder
-    `visualization` by name: `worst*` with the worst queries, `localization*` as samples, `<pair>_sequence*` with the
-    sequences, all remaining ones as maps. A picture's title is the PNG's `Title` or `Description`.
+    The main table of each scene is also written, as `report-<scene>.csv` and `.tex`. Pictures are embedded, so the file
+    can be mailed alone. Links to tables, poses, notebooks and recordings are relative to the run folder. The report
+    leaves out missing files and names unreadable ones. It shows the pictures in the folder `visualization` by name:
+    `worst*` with the worst queries, `localization*` as samples, `<pair>_sequence*` with the sequences, all remaining
+    ones as maps. A picture's title is the PNG's `Title` or `Description`.
 
     Raises:
         ArtifactError: `run.json` is missing or torn.
@@ -111,7 +117,7 @@ def write_report(run_dir: str | Path) -> Path:
     for name in map(str, run["scenes"]):
         # Every scene gets an equal share, or the first scenes would leave no room for the last.
         album = Album(run_dir, PICTURE_BUDGET // len(run["scenes"]), left_out)
-        scenes.append(_scene(SceneFiles(run_dir, name), str(run["inputs"].get(name, "")), album))
+        scenes.append(_scene(SceneFiles(run_dir, name), run, album))
     source = Path(__file__).with_suffix(".html.j2").read_text(encoding="utf-8")
     template = Template(source, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     page = template.render(
@@ -145,7 +151,7 @@ def read_run(path: Path) -> dict[str, Any]:
         raise ArtifactError(f"{path}: expected a JSON object, found a {type(content).__name__}.")
     empty = {"name": path.parent.name, "created": "", "status": "", "error": None, "total_seconds": None}
     lists: dict[str, Any] = {"manifest": {}, "versions": {}, "machine": {}, "inputs": {}, "scenes": [], "stages": []}
-    run = {**empty, "peak_memory_mb": None, "work_seconds": None, "code": "", **lists, **content}
+    run = {**empty, "peak_memory_mb": None, "work_seconds": None, "code": "", "commit": "", **lists, **content}
     wrong = [key for key, value in lists.items() if not isinstance(run[key], type(value))]
     wrong += [] if wrong or all(isinstance(row, dict) for row in run["stages"]) else ["stages"]
     if wrong:
@@ -170,8 +176,9 @@ def _summary(run: dict[str, Any]) -> list[tuple[str, str]]:
         parts.append(("peak memory", f"{run['peak_memory_mb'] / 1000:.2f} GB"))
     # The page lists Python's version with the other versions.
     machine = {key: value for key, value in run["machine"].items() if key != "python"}
-    texts = [f"{value} cores" if key == "cores" else str(value) for key, value in machine.items()]
-    return [*parts, ("machine", ", ".join(texts))]
+    texts = {"cores": "{} cores", "memory_gb": "{} GB of memory", "gpu": "GPU: {}"}
+    shown = ", ".join(texts.get(key, "{}").format(value) for key, value in machine.items())
+    return [*parts, ("machine", shown), ("git commit", run["commit"])]
 
 
 def _stage_name(row: dict[str, Any]) -> str:
@@ -181,7 +188,6 @@ def _stage_name(row: dict[str, Any]) -> str:
 def _stages(run: dict[str, Any], run_dir: Path) -> Markup:
     rows = []
     for row in run["stages"]:
-        counts = ", ".join(f"{value} {key.replace('_', ' ')}" for key, value in (row.get("counts") or {}).items())
         rows.append({
             "scene": row.get("scene") or "",
             "stage": _anchor(_stage_name({**row, "scene": ""}), run_dir, run_dir / str(row.get("notebook") or "")),
@@ -189,7 +195,7 @@ def _stages(run: dict[str, Any], run_dir: Path) -> Markup:
             "time": row.get("seconds"),
             "of it work": row.get("work_seconds", row.get("kernel_seconds")),
             "peak memory": row.get("peak_memory_mb") or None,
-            "counts": counts,
+            "counts": counts_text(row.get("counts") or {}),
         })  # fmt: skip
     numbers: dict[str, Write] = {"time": seconds_text, "of it work": seconds_text, "peak memory": "{:.0f} MB".format}
     # As objects, or pandas would turn links into plain text.
@@ -211,7 +217,7 @@ def _not_done(run: dict[str, Any]) -> Markup:
 # A scene
 
 
-def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any]:
+def _scene(files: SceneFiles, run: Mapping[str, Any], album: "Album") -> dict[str, Any]:
     """Return the template variables of one scene."""
     messages: list[str] = []
     older, older_images = older_files(files.evaluation, "evaluate"), older_files(files.visualization, "visualize")
@@ -231,7 +237,6 @@ def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any
     if len(recall):
         messages += read_json(sidecar_path(files.evaluation / "recall.csv")).get("settings", {}).get("messages", [])
     unit = metrics.unit_of(*thresholds)
-    small, factor = metrics.small_unit(unit)
     remarks, lengths = list[str](), list[str]()
     for path in sorted(files.poses_dir.glob(f"{glob.escape(files.scene)}_map_*.json")):
         record = read_map_record(path)
@@ -241,7 +246,8 @@ def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any
         depth = f"a tenth of the median scene depth of a map{': ' if lengths else ''}{', '.join(lengths)}"
         remarks.append(f"The unit of the poses is not known: {unit} is {depth}.")
     verdict, headlines = _verdict(recall, errors, queries, thresholds)
-    matrices, note = _retrieval(retrieval, headlines, unit)
+    found, note = _retrieval(retrieval, headlines, unit)
+    table, links = _main_table(files, recall, queries, thresholds)
     stills = sorted((path for path in files.visualization.glob("*.png") if path.name not in older), key=_natural)
     worst = [path for path in stills if path.name.startswith("worst")]
     samples = [path for path in stills if path.name.startswith("localization")]
@@ -250,25 +256,22 @@ def _scene(files: SceneFiles, fingerprint: str, album: "Album") -> dict[str, Any
     figures = {files.evaluation / f"{name}.png": texts for name, texts in EVALUATION_FIGURES.items()}
     return {
         "name": files.scene,
-        "fingerprint": fingerprint,
+        "fingerprint": str(run["inputs"].get(files.scene, "")),
         "verdict": verdict,
         "wrong_ok": _wrong_ok(errors, unit),
         "headlines": headlines,
         "messages": messages,
         "remarks": remarks,
-        "recall": [_matrix(recall, column, f"Recall at {metrics.threshold_text(column)} [%]") for column in thresholds],
-        "medians": thresholds and [
-            _matrix(recall, "median_rotation_deg", "Median rotation error [°]", number),
-            _matrix(
-                recall, "median_translation_m", f"Median translation error [{small}]", lambda v: number(v * factor)
-            ),
-        ],
-        "pairs": _pairs(recall, thresholds),
+        "method": review.method(files, "rerank" in run["manifest"]),
+        "table": table,
+        "table_links": links,
+        "evaluated": bool(thresholds),
+        "map_table": _table(review.maps_table(files), "Images and triangulated points of each map"),
         "losses": _losses(losses),
         "missed": int(losses["missed"].sum()) if "missed" in losses else 0,
         "failures": _failures(queries),
         "worst": _worst(errors if len(errors) else queries, thresholds),
-        "retrieval": matrices,
+        "retrieval": found,
         "retrieval_note": note,
         # Pictures of failures come first, while there is room: they are the hardest to understand from tables alone.
         "worst_pictures": [album.picture(path) for path in worst],
@@ -315,16 +318,15 @@ def _verdict(
     """Summarize the quality of the poses in sentences, and in headlines: a number and its meaning."""
     verdict, headlines = list[str](), list[tuple[str, str]]()
     if len(queries):
-        pairs = len(queries[["map_device", "query_device"]].drop_duplicates())
-        counts = status_counts(queries["status"])
-        parts = ", ".join(f"{count} {status.replace('_', ' ')}" for status, count in counts.items())
-        verdict.append(f"{len(queries)} queries in {pairs} pair{'s' * (pairs != 1)} of devices: {parts}.")
+        pairs = counted(len(queries[review.PAIR].drop_duplicates()), "pairs of devices")
+        counts = counts_text(status_counts(queries["status"]))
+        verdict.append(f"{counted(len(queries), 'queries')} in {pairs}: {counts}.")
         verdict += _escalation(queries)
     done = recall.dropna(subset=thresholds) if thresholds else recall.iloc[:0]
     if not len(done):
         return verdict, headlines
     for column in thresholds:
-        headlines.append((f"{percent(done[column].mean())} %", f"mean recall at {metrics.threshold_text(column)}"))
+        headlines.append((_share(done[column].mean()), f"mean recall at {metrics.threshold_text(column)}"))
     if len(errors):
         rotation_deg, translation_m = errors[["rotation_error_deg", "translation_error_m"]].median()
         length = _length(translation_m, metrics.unit_of(thresholds[0]))
@@ -332,14 +334,14 @@ def _verdict(
     strict, limit = thresholds[0], metrics.threshold_text(thresholds[0])
     weakest = done.loc[done[strict].idxmin()]
     if weakest[strict] == done[strict].max():
-        verdict.append(f"Every pair has {percent(weakest[strict])} % at {limit}.")
+        verdict.append(f"Every pair has {_share(weakest[strict])} at {limit}.")
     else:
         pair = f"{weakest['query_device']} queries in the {weakest['map_device']} map"
-        verdict.append(f"Weakest pair at {limit}: {pair}, {percent(weakest[strict])} %.")
+        verdict.append(f"Weakest pair at {limit}: {pair}, {_share(weakest[strict])}.")
     if "ok_wrong" in done:
         wrong = float((done["ok_wrong"] * done["queries"]).sum() / done["queries"].sum())
         what = f"called ok, but beyond {metrics.WRONG[0]:g}°, {metrics.WRONG[1]:g} {metrics.unit_of(strict)}"
-        headlines.append((f"{percent(wrong)} %", what))
+        headlines.append((_share(wrong), what))
     return verdict, headlines
 
 
@@ -351,10 +353,11 @@ def _escalation(queries: pd.DataFrame) -> list[str]:
     before, after = (statuses(escalated[name]) for name in ("first_status", "status"))
     posed = ((before == Status.FAILED) & (after != Status.FAILED)).sum()
     seconds = (escalated["seconds"] - escalated["first_seconds"]).sum()
-    gained = f", {posed} without a pose got one" if posed else ""
+    gained = f", {posed} with a first pose" if posed else ""
     return [
-        f"{len(escalated)} were not sure and escalated to further features: {(after == Status.OK).sum()} are ok "
-        f"now{gained}. That took {number(seconds)} s, {number(seconds / len(escalated))} s per query."
+        f"{counted(len(escalated), 'queries')} escalated to further features, because not sure: "
+        f"{(after == Status.OK).sum()} now ok{gained}. That took {number(seconds)} s, "
+        f"{number(seconds / len(escalated))} s per query."
     ]
 
 
@@ -362,7 +365,7 @@ def _escalation(queries: pd.DataFrame) -> list[str]:
 
 
 def _table(frame: pd.DataFrame, caption: str, formats: Mapping[str, Write] = {}, bars: Sequence[str] = ()) -> Markup:
-    """Return a table as HTML, in a region that scrolls; empty if it has no rows. A named axis shows its labels.
+    """Return a table as HTML, in a region that scrolls; empty if it has no rows.
 
     Args:
         formats: functions that write the numbers of columns. Without one, a number has no decimals. Shares are shaded.
@@ -377,51 +380,59 @@ def _table(frame: pd.DataFrame, caption: str, formats: Mapping[str, Write] = {},
     style.format(lambda value: f"{value:.0f}" if isinstance(value, float) else escape(value), na_rep="–")
     for name in frame.columns.intersection([*formats]):
         style.format(formats[name], subset=[name], na_rep="–")
-    style.map(_shade, subset=[name for name in frame if formats.get(name) in (percent, _share)])
+    style.map(_shade, subset=[name for name in frame if formats.get(name) in (percent, _share, _recall)])
+    style.map(lambda share: "color: var(--alarm)" if share > 0 else "", subset=frame.columns.intersection([OK_WRONG]))
     style.bar(subset=[name for name in bars if frame[name].max() > 0], color="#14629f40", vmin=0)
-    texts = frame.select_dtypes(exclude="number").astype(str)
+    texts = frame.drop(columns=[*formats], errors="ignore").select_dtypes(exclude="number").astype(str)
     long = [name for name in texts if texts[name].str.len().max() > LONG]
     style.set_table_styles({name: [{"selector": "", "props": "text-align: left"}] for name in texts})
     style.set_td_classes(pd.DataFrame("long", frame.index, long))
-    style.format_index(escape, axis="index").format_index(escape, axis="columns")
+    style.hide(axis="index").format_index(escape, axis="columns")
     style.set_caption(Markup("<span>{}</span>").format(caption))
-    if frame.columns.name:
-        style.set_table_attributes('class="matrix"')
-    else:
-        style.hide(axis="index")
     html = re.sub(r'class="(col|row)_heading', r'scope="\1" class="\1_heading', style.to_html())  # for screen readers
     region = Markup('<div class="scroll" role="region" tabindex="0" aria-label="{}">{}</div>')
     return region.format(caption, Markup(html))
 
 
-def _shade(share: float) -> str:
+def _shade(value: float | Interval) -> str:
+    share = value.share if isinstance(value, Interval) else value
     if math.isnan(share):
         return ""
     return f"background: rgb(20 98 159 / {90 * share:.0f}%)" + ("; color: #fff" if share > 0.6 else "")
 
 
-def _matrix(table: pd.DataFrame, column: str, title: str, write: Write = percent) -> Markup:
-    """Return a table of map devices (rows) by query devices (columns)."""
-    values = table.set_index(["map_device", "query_device"])[column].unstack().rename_axis(columns="map \\ query")
-    values = values.loc[table["map_device"].unique(), table["query_device"].unique()].rename_axis(index=None)
-    return _table(values, title, dict.fromkeys(values, write))
+def _recall(value: float | Interval) -> str:
+    return str(value) if isinstance(value, Interval) else percent(value)
 
 
-def _scores(table: pd.DataFrame, caption: str, thresholds: list[str]) -> Markup:
-    """Return a table with columns of recall and median errors."""
+def _named(table: pd.DataFrame, thresholds: list[str]) -> tuple[pd.DataFrame, dict[str, Write]]:
+    """Return a table with columns of recall and median errors under names for a page, and functions that write them."""
     small, factor = metrics.small_unit(metrics.unit_of(*thresholds))
-    shares = {name: f"recall {metrics.threshold_text(name)}" for name in thresholds} | {"ok_wrong": "ok but wrong"}
+    shares = {name: f"recall {metrics.threshold_text(name)} [%]" for name in thresholds} | {"ok_wrong": OK_WRONG}
     names = {"map_device": "map", "query_device": "query", "low_confidence": "low confidence", "state": "note"}
-    names |= {"median_rotation_deg": "median [°]", "median_translation_m": f"median [{small}]", **shares}
-    formats: dict[str, Write] = {"median [°]": number, f"median [{small}]": lambda length: number(factor * length)}
-    return _table(table.rename(columns=names), caption, formats | dict.fromkeys(shares.values(), _share))
+    names |= {"median_rotation_deg": "median error [°]", "median_translation_m": f"median error [{small}]", **shares}
+    names |= {"seconds_median": "time, median [s]", "seconds_95": "time, 95 % [s]"}
+    formats: dict[str, Write] = {"median error [°]": number}
+    formats |= {f"median error [{small}]": lambda length: number(factor * length)}
+    formats |= dict.fromkeys(shares.values(), _recall)
+    formats |= {OK_WRONG: _unshaded, **dict.fromkeys(["time, median [s]", "time, 95 % [s]"], number)}
+    return table.rename(columns=names), formats
 
 
-def _pairs(recall: pd.DataFrame, thresholds: list[str]) -> Markup:
-    columns = ["map_device", "query_device", "queries", "localized", "ok", "low_confidence", "failed", *thresholds]
-    columns += ["median_rotation_deg", "median_translation_m", "ok_wrong", "state"]
-    shown = recall[[name for name in columns if name in recall]].replace({"state": {"evaluated": ""}})
-    return _scores(shown, "Counts of queries, recall and median errors of every pair", thresholds)
+def _main_table(
+    files: SceneFiles, recall: pd.DataFrame, queries: pd.DataFrame, thresholds: list[str]
+) -> tuple[Markup, list[Markup]]:
+    """Return the table of all pairs, and links to the same as CSV and LaTeX, which are written."""
+    table = review.main_table(recall, queries, thresholds)
+    shown, formats = _named(review.readable(table, thresholds), thresholds)
+    texts = shown.apply(lambda column: column.map(formats.get(column.name, _plain)))
+    stem = files.run / f"report-{files.scene}"
+    paths = review.write_tables(stem, metrics.named_by_unit(table, metrics.unit_of(*thresholds)), texts, CAPTION)
+    return _table(shown, CAPTION, formats), [Markup(_anchor(path.name, files.run, path)) for path in paths]
+
+
+def _plain(value: Any) -> str:
+    return ("–" if math.isnan(value) else f"{value:.0f}") if isinstance(value, float) else str(value)
 
 
 def _steps(sequences: pd.DataFrame, thresholds: list[str]) -> Markup:
@@ -431,7 +442,8 @@ def _steps(sequences: pd.DataFrame, thresholds: list[str]) -> Markup:
     medians = dict.fromkeys(["median_rotation_deg", "median_translation_m"], "median")
     over_pairs = {"queries": "sum", **dict.fromkeys(thresholds, "mean"), **medians, **dict.fromkeys(CHANGES, "sum")}
     caption = "Queries after each step of the sequence stage: mean recall and median error of the pairs"
-    return _scores(sequences.groupby("step", sort=False).agg(over_pairs).reset_index(), caption, thresholds)
+    table, formats = _named(sequences.groupby("step", sort=False).agg(over_pairs).reset_index(), thresholds)
+    return _table(table, caption, formats)
 
 
 def _changes(changes: pd.DataFrame, unit: str) -> Markup:
@@ -491,9 +503,9 @@ def _wrong_ok(errors: pd.DataFrame, unit: str) -> Markup:
     wrong = called_ok[~metrics.is_below(turned, moved, metrics.WRONG)]
     wrong = wrong.sort_values("translation_error_m", ascending=False)
     limit = f"{metrics.WRONG[0]:g}°, {metrics.WRONG[1]:g} {unit}"
-    caption = f"{len(wrong)} of {len(called_ok)} poses that are called ok are wrong: beyond {limit}."
+    caption = f"Called ok, but wrong (beyond {limit}): {len(wrong)} of {counted(len(called_ok), 'poses')}."
     if len(wrong) > WORST:
-        caption += f" These are the {WORST} worst; evaluation/errors.csv has all."
+        caption += f" The {WORST} worst of them; evaluation/errors.csv has all."
     return _listed(wrong[:WORST], caption, unit)
 
 
@@ -504,9 +516,10 @@ def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Markup:
     threshold = metrics.parse_threshold(thresholds[0]) if thresholds else metrics.THRESHOLDS[0]
     unit = metrics.unit_of(*thresholds)
     worst = queries.iloc[metrics.worst_first(queries, threshold)[:WORST]]
-    caption = f"The {len(worst)} least supported; there is no ground truth to compare with"
+    many = f"{len(worst)} " if len(worst) > 1 else ""
+    caption = f"The {many}least supported; there is no ground truth to compare with"
     if "rotation_error_deg" in queries:
-        caption = f"The {len(worst)} worst, by the larger of rotation error / {threshold[0]:g}° and "
+        caption = f"The {many}worst, by the larger of rotation error / {threshold[0]:g}° and "
         caption += f"translation error / {threshold[1]:g} {unit}"
     return _listed(worst, caption, unit)
 
@@ -518,12 +531,17 @@ def _listed(queries: pd.DataFrame, caption: str, unit: str) -> Markup:
         rows, names = queries.to_dict("records"), {}
         table["off by"] = [off_by(row, unit=unit) for row in rows]
         table["why"] = [_why(row) for row in rows]
-    table["status"], table["inliers"] = queries["status"].str.replace("_", " "), queries["num_inliers"]
-    table["image"] = queries["image"].fillna("").map(_shown_names)
+    table["status"] = queries["status"].str.replace("low_confidence", "low confidence").map(_shortened)
+    table["inliers"] = queries["num_inliers"]
     names |= {"p_correct": "stated to be right", "rival_support": "support of a rival"}
     known = queries.filter([*names]).dropna(axis="columns", how="all").rename(columns=names)
-    formats = {"stated to be right": "{:.1%}".format, "support of a rival": "{:.0%}".format}
-    return _table(table.join(known), caption, formats)
+    formats: dict[str, Write] = dict.fromkeys(["stated to be right", "support of a rival"], _unshaded)
+    names_of_images = queries["image"].fillna("").map(_shown_names)
+    return _table(table.join(known).assign(image=names_of_images), caption, formats)
+
+
+def _shortened(status: str) -> str:
+    return status if len(status) <= MAX_STATUS else f"{status[:MAX_STATUS]} …"
 
 
 def _queries(table: pd.DataFrame) -> "pd.Series[str]":
@@ -545,18 +563,23 @@ def _why(row: dict[str, Any]) -> str:
     return "within every threshold" if losses else ""
 
 
-def _retrieval(retrieval: pd.DataFrame, headlines: list[tuple[str, str]], unit: str) -> tuple[list[Markup], str]:
+def _retrieval(retrieval: pd.DataFrame, headlines: list[tuple[str, str]], unit: str) -> tuple[Markup, str]:
+    """Return the shares of queries with a good reference as a table, empty if all pairs are alike; and a note."""
     ks = [column for column in retrieval.columns if column.startswith("recall@")]
     done = retrieval.dropna(subset=ks) if ks else retrieval.iloc[:0]
     if not len(done):
-        return [], ""
-    titles = {k: f"In the first {k.removeprefix('recall@')} [%]" for k in ks} | {"in_map": "Anywhere in the map [%]"}
-    matrices = [_matrix(retrieval, column, title) for column, title in titles.items() if column in done]
+        return Markup(), ""
     first = ks[-1].removeprefix("recall@")
-    headlines.append((f"{percent(done[ks[-1]].mean())} %", f"have a good reference in the first {first}"))
-    reach = f"{done['radius_m'].iloc[0]:g} {unit}"
-    note = f"A good reference stands within {reach} of the query's true camera and looks the "
-    return matrices, f"{note}same way to within {done['angle_deg'].iloc[0]:g}°."
+    headlines.append((_share(done[ks[-1]].mean()), f"have a good reference in the first {first}"))
+    names = {k: f"in the first {k.removeprefix('recall@')}" for k in ks} | {"in_map": "anywhere in the map"}
+    note = f"A good reference stands within {done['radius_m'].iloc[0]:g} {unit} of the query's true camera and looks "
+    note += f"the same way to within {done['angle_deg'].iloc[0]:g}°."
+    shown = done.filter([*names])
+    if (shown.nunique() == 1).all():
+        alike = ", ".join(f"{_share(share)} {names[str(name)]}" for name, share in shown.iloc[0].items())
+        return Markup(), f"Queries with a good reference, in every pair: {alike}. {note}"
+    table = retrieval[[*review.PAIR, *shown]].rename(columns={"map_device": "map", "query_device": "query", **names})
+    return _table(table, "Queries with a good reference [%]", dict.fromkeys(names.values(), percent)), note
 
 
 def _links(files: SceneFiles, older: Collection[str]) -> dict[str, Markup]:
@@ -587,7 +610,11 @@ def _natural(path: Path) -> list[Any]:
 
 
 def _share(share: float) -> str:
-    return f"{percent(share)} %"
+    return f"{percent(share)}\N{NO-BREAK SPACE}%"
+
+
+def _unshaded(share: float) -> str:
+    return _share(share)
 
 
 def _length(length: float, unit: str) -> str:
@@ -625,7 +652,6 @@ class Album:
             with Image.open(path) as image:
                 info = getattr(image, "text", {})
                 title = title or info.get("Title") or info.get("Description") or path.stem.replace("_", " ")
-                wide = image.width > 1.8 * image.height
                 data, kind = path.read_bytes(), "png"
                 if image.width > MAX_WIDTH or len(data) > 150_000:
                     small = as_jpeg(image, MAX_WIDTH)
@@ -637,4 +663,4 @@ class Album:
             self.left_out.append(name)
             return Picture("", title, caption, link)
         self.room -= len(data)
-        return Picture(f"data:image/{kind};base64,{base64.b64encode(data).decode()}", title, caption, link, wide)
+        return Picture(f"data:image/{kind};base64,{base64.b64encode(data).decode()}", title, caption, link)

@@ -8,12 +8,14 @@ import platform
 import re
 import shutil
 import socket
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -178,7 +180,6 @@ class RunLog:
     def write(self) -> None:
         """Write the current state to `run.json`."""
         rows = self.all_rows()
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         work = sum(row.get("work_seconds", 0.0) for row in rows if row["status"] == "done")
         content = {
             "name": self.manifest.name,
@@ -190,8 +191,9 @@ class RunLog:
             "pid": os.getpid(),
             "manifest": self.manifest.model_dump(mode="json", exclude_none=True),
             "versions": _versions(),
-            "machine": {"cores": cores, "python": platform.python_version(), "platform": platform.platform()},
+            "machine": machine(),
             "code": self.code,
+            "commit": commit(),
             "scenes": list(self.inputs),
             "inputs": self.inputs,
             "stages": rows,
@@ -233,6 +235,57 @@ def summary(run_dir: Path) -> dict[str, Any]:
     of_stage = ("scene", "stage", "status", "reason", "seconds", "counts", "left_out", "error")
     stages = [{key: row[key] for key in of_stage if key in row} for row in record.get("stages", ())]
     return {key: record.get(key) for key in kept} | {"run": str(run_dir), "stages": stages}
+
+
+def counted(number: int, plural: str) -> str:
+    """Return a count with its noun: `2 queries`, `1 query`, `1 pair of devices`."""
+    noun, of, rest = plural.replace("_", " ").partition(" of ")
+    if number == 1:
+        noun = f"{noun[:-3]}y" if noun.endswith("ies") else noun.removesuffix("s")
+    return f"{number} {noun}{of}{rest}"
+
+
+def counts_text(counts: Mapping[str, int]) -> str:
+    """Return the counts of a stage in words."""
+    return ", ".join(counted(number, name) for name, number in counts.items())
+
+
+@cache
+def machine() -> dict[str, Any]:
+    """Return the CPU, the cores that this process may use, memory, GPUs (`none` without any) and operating system."""
+    import psutil
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    info = Path("/proc/cpuinfo")
+    named = re.search(r"model name\s*: (.+)", info.read_text()) if info.is_file() else None
+    cpu = named[1] if named else _output("sysctl", "-n", "machdep.cpu.brand_string")  # macOS
+    gpus = _output("nvidia-smi", "--query-gpu=name", "--format=csv,noheader").splitlines()
+    return {
+        "cpu": cpu or platform.processor() or platform.machine(),
+        "cores": cores,
+        "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
+        "gpu": ", ".join(gpus) or "none",
+        "platform": platform.platform(),
+    }
+
+
+@cache
+def commit() -> str:
+    """Return the git commit of the toolkit, with `-dirty` if files differ from it; empty without a repository."""
+    root = Path(__file__).resolve().parents[2]
+    # Otherwise, an installed toolkit would name the commit of the repository around its environment.
+    if not (root / ".git").exists():
+        return ""
+    described = "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"
+    return _output("git", "--no-optional-locks", "-C", str(root), *described)
+
+
+def _output(*command: str) -> str:
+    """Return what a command prints; empty if it fails or does not exist."""
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=20, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""
 
 
 def _versions() -> dict[str, str]:
