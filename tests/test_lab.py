@@ -24,8 +24,9 @@ def test_a_saved_notebook_has_its_results_and_no_widgets(tmp_path: Path) -> None
     picture = {"output_type": "display_data", "metadata": {}, "data": {"image/jpeg": "aGk="}}
     cell = {"cell_type": "code", "id": "a", "metadata": {}, "source": "1", "execution_count": 1}
     note = {"cell_type": "markdown", "id": "b", "metadata": {}, "source": "# mine"}
+    view = {"output_type": "display_data", "metadata": {}, "data": bar["data"] | picture["data"]}
     content = {
-        "cells": [cell | {"outputs": [bar, text, picture, bar]}, note],
+        "cells": [cell | {"outputs": [bar, text, picture, bar]}, cell | {"id": "c", "outputs": [view]}, note],
         "metadata": {"widgets": {"application/vnd.jupyter.widget-state+json": {}}},
         "nbformat": 4,
         "nbformat_minor": 5,
@@ -34,7 +35,9 @@ def test_a_saved_notebook_has_its_results_and_no_widgets(tmp_path: Path) -> None
     saved = manager.get("mine.ipynb")["content"]
     assert [output.output_type for output in saved["cells"][0]["outputs"]] == ["stream", "display_data"]
     assert saved["cells"][0]["outputs"][1]["data"] == picture["data"]
-    assert saved["cells"][1]["source"] == "# mine"
+    (kept,) = saved["cells"][1]["outputs"]
+    assert kept["data"] == picture["data"], "what a viewer left for a page without a kernel"
+    assert saved["cells"][2]["source"] == "# mine"
     assert "widgets" not in saved["metadata"]
     manager.save({"type": "file", "format": "text", "content": "a file"}, "file.txt")
     assert (tmp_path / "file.txt").read_text() == "a file"
@@ -55,11 +58,12 @@ def test_lab_is_on_copies_that_keep_what_was_done_in_them(tmp_path: Path) -> Non
         (tmp_path / "notebooks" / f"{name}.ipynb").write_text("first")
 
     def lab() -> str:
-        done = subprocess.run(["make", "lab"], cwd=tmp_path, capture_output=True, text=True, check=True)
+        ask = ["make", "lab", "LAB_ARGS=--port 9"]
+        done = subprocess.run(ask, cwd=tmp_path, capture_output=True, text=True, check=True)
         return done.stdout
 
     said = lab()
-    assert "-m jupyterlab --config=notebooks/lab_config.py --notebook-dir lab" in said
+    assert "-m jupyterlab --config=notebooks/lab_config.py --notebook-dir . --port 9 lab/start.ipynb" in said
     assert "newer" not in said
     (tmp_path / "lab" / "1.ipynb").write_text("mine")
     (tmp_path / "lab" / "2.ipynb").write_text("mine")

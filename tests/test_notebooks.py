@@ -16,7 +16,7 @@ import pandas as pd
 import pytest
 
 from toolkit import notebook, pipeline
-from toolkit.errors import ManifestError, StageError
+from toolkit.errors import ArtifactError, ManifestError, StageError
 from toolkit.manifest import OPTIONAL, STAGES, Manifest, RetrieveSettings
 from toolkit.notebook import notebook_parameters, notebook_path
 from toolkit.runs.folder import LOG_VARIABLE
@@ -25,7 +25,7 @@ from toolkit.runs.folder import LOG_VARIABLE
 OF_THE_RUN = {
     *("sessions_root", "out_dir", "map_feats_root", "out_jsonl", "retrieval_dir", "features_dir", "map_dir"),
     *("poses_dir", "device", "subsession", "map_device", "query_device", "queries"),
-    *("skip_existing", "pairs", "reranked_dir", "inspect"),
+    *("skip_existing", "pairs", "reranked_dir", "inspect", "run"),
 }
 FUNCTIONS = {
     "embed": "toolkit.embed:embed_sessions",
@@ -62,6 +62,53 @@ def test_notebooks_are_committed_clean(stage: str) -> None:
     assert [cell.id for cell in content.cells] == [
         f"{path.name.partition('_')[0]}-{i:02d}" for i in range(len(content.cells))
     ]
+
+
+def test_the_first_notebook_has_short_cells_with_a_text_above_each() -> None:
+    content = nbformat.read(notebook_path("start"), as_version=4)
+    nbformat.validate(content)
+    code = [cell for cell in content.cells if cell.cell_type == "code"]
+    assert not any(cell.outputs or cell.execution_count for cell in code)
+    assert all(len(cell.source.splitlines()) <= 7 for cell in code)
+    assert all("  # " in line for line in content.cells[1].source.splitlines())
+    kinds = [cell.cell_type for cell in content.cells[3:]]
+    assert kinds == ["markdown", "code"] * (len(kinds) // 2)
+
+
+@pytest.mark.slow
+def test_the_first_notebook_runs_on_any_run(small_run: Path, tmp_path: Path, released_weights: None) -> None:
+    notebook.execute(notebook_path("start"), tmp_path / "start.ipynb", {"run": str(small_run), "map_device": "hl"})
+    shown = nbformat.read(tmp_path / "start.ipynb", as_version=4)
+    outputs = {cell.id: [*output.data] for cell in shown.cells for output in cell.get("outputs", [])
+               if "data" in output}  # fmt: skip
+    pictures = {name for name, kinds in outputs.items() if any(kind.startswith("image/") for kind in kinds)}
+    assert pictures == {"map", "references", "matches", "pose-3d", "worst", "what-if", "photo"}
+    assert {name for name, kinds in outputs.items() if "text/html" in kinds} >= {"setup", "query", "pose", "report"}
+
+
+def test_counts_that_do_not_balance_end_a_notebook() -> None:
+    notebook.finish(queries=3, ok=1, low_confidence=1, failed=1)
+    with pytest.raises(AssertionError, match=r"queries were lost: 2 of 3"):
+        notebook.finish(queries=3, ok=1, low_confidence=1, failed=0)
+
+
+def test_a_notebook_by_hand_takes_what_the_run_has_and_writes_beside_it(
+    small_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "fox"
+    (run / small_capture.name / "embeddings").mkdir(parents=True)
+    (run / small_capture.name / "embeddings" / "marker").write_text("of the run")
+    stages = [{"parameters": {"sessions_root": str(small_capture / "sessions")}}]
+    (run / "run.json").write_text(json.dumps({"scenes": [small_capture.name], "stages": stages}))
+    made: list[str] = []
+    monkeypatch.setattr(notebook, "_run_stage", lambda stage, *more: made.append(stage))
+    folders = notebook.start("retrieve", run=str(run), map_feats_root=None, out_jsonl=None)
+    assert folders.sessions_root == small_capture / "sessions"
+    assert (folders.map_feats_root / "marker").read_text() == "of the run"
+    assert folders.out_jsonl == tmp_path / "fox-by-hand" / small_capture.name / "retrieval"
+    assert made == []
+    with pytest.raises(ArtifactError, match=r"fos: no such run.*fox"):
+        notebook.start("retrieve", run=str(tmp_path / "fos"), map_feats_root=None, out_jsonl=None)
 
 
 @pytest.mark.parametrize("stage", STAGES)
@@ -148,7 +195,7 @@ def test_parameters_of_the_run_are_arguments_of_the_stage(stage: str) -> None:
     for name, default in notebook_parameters(notebook_path(stage)).items():
         if name not in OF_THE_RUN or (stage, name) == ("rerank", "map_dir"):  # of the table of overlaps alone
             continue
-        if name == "inspect":  # what is shown in the end
+        if name in ("inspect", "run"):  # what is shown in the end; where folders that are not given are taken from
             continue
         assert name in signature
         if default is not None and signature[name].default is not inspect.Parameter.empty:

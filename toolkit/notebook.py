@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -36,6 +37,7 @@ from toolkit.manifest import (
     nearest,
 )
 from toolkit.manifest.messages import explain
+from toolkit.results.opening import no_such_run
 from toolkit.runs.folder import LOG_VARIABLE, RECORD, counts_text, log_to
 from toolkit.runs.kernel import TEXT_BARS, Kernels, MemoryWatch, kernel_error
 from toolkit.runs.pairs import left_out_of
@@ -49,6 +51,8 @@ log = logging.getLogger(__name__)
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 Say = Callable[..., None]
 """Function that prints the progress lines of a run; called like `print`."""
+DEMO_RUN = "runs/demo"
+"""Folder of the demo's run in the repository, the default of notebooks."""
 COUNTS_MIME = "application/vnd.visual-localization.counts+json"
 # The stages whose results each stage reads, besides the capture. If one of them runs again, so does the stage.
 UPSTREAM: dict[str, tuple[str, ...]] = {
@@ -95,15 +99,18 @@ class Folders(SimpleNamespace):
         return "\n".join(f"{name:<{max(map(len, folders))}}  {path}" for name, path in folders.items())
 
 
-def start(stage: str, sessions_root: str | None = None, **folders: str | None) -> Folders:
+def start(
+    stage: str, sessions_root: str | None = None, run: str | None = None, **folders: str | None
+) -> Folders:
     """Resolve the folders of a notebook; check its parameters.
 
     Args:
         stage: name of the stage, one of `toolkit.manifest.STAGES`.
-        sessions_root: folder `sessions` of a capture; None: the demo capture, rendered if absent.
-        **folders: the notebook's other folders by the names of its parameters; None: below `runs/<scene>-by-hand/` of
-            the repository, see `_take_from_run`. If such a default folder lacks the results of an earlier stage, or
-            they are older than those of the stage before it, that stage runs now.
+        sessions_root: folder `sessions` of a capture; None: that of the run.
+        run: run folder, see `find_run`. If it is absent, and the demo's, the demo capture is rendered.
+        **folders: the notebook's other folders by the names of its parameters; None: below `<run>-by-hand/` beside the
+            run, or `runs/<scene>-by-hand/` of the repository, see `_take_from_run`. If such a default folder lacks the
+            results of an earlier stage, or they are older than those of the stage before it, that stage runs now.
 
     Raises:
         ManifestError: a parameter is unknown to the notebook, or has a wrong type; or the folder for the results of a
@@ -115,20 +122,38 @@ def start(stage: str, sessions_root: str | None = None, **folders: str | None) -
         logging.captureWarnings(True)
         log_to(Path(run_log))
     check_given(stage)
-    sessions, root = sessions_or_demo(sessions_root), _root()
+    taken_from = find_run(run) if run is not None and sessions_root is None else None
+    by_hand: Path | None = None
+    stages = read_json(taken_from / RECORD).get("stages") if taken_from is not None else None
+    if taken_from is not None and stages:
+        sessions_root = stages[0]["parameters"].get("sessions_root")
+        by_hand = taken_from.with_name(f"{taken_from.name}-by-hand")
+    elif taken_from is not None and taken_from != (_root() / DEMO_RUN).resolve():
+        raise no_such_run(taken_from)
+    else:
+        taken_from = None
+    sessions = sessions_or_demo(sessions_root)
     _check_devices_and_queries(stage, sessions)
     scene = sessions.parent.name
-    files = SceneFiles(root / "runs" / f"{scene}-by-hand", scene)
+    files = SceneFiles(by_hand or _root() / "runs" / f"{scene}-by-hand", scene)
+    source = taken_from or _finished_run(files.run.parent, scene)
     if None in folders.values():
-        _take_from_run(stage, files)
+        _take_from_run(stage, files, source)
     defaults = files.folders(stage)
-    _make_upstream(stage, sessions, files, {defaults[name] for name, folder in folders.items() if folder is None})
+    made: set[Path | None] = {defaults[name] for name, folder in folders.items() if folder is None}
+    _make_upstream(stage, sessions, files, made, source)
     resolved = {"sessions_root": sessions}
     for name, folder in folders.items():
         resolved[name] = Path(folder).expanduser().resolve() if folder else defaults[name]
         if folder and run_log is None and defaults[name] == files.of_stage(stage):
             _require_outside_of_runs(name, resolved[name])
     return Folders(stage, **resolved)
+
+
+def find_run(run: str | Path) -> Path:
+    """Return a run folder: as given, relative to the notebook, or else relative to the repository."""
+    path = Path(run).expanduser()
+    return path.resolve() if path.is_absolute() or path.is_dir() else (_root() / path).resolve()
 
 
 def _require_outside_of_runs(name: str, folder: Path) -> None:
@@ -196,12 +221,62 @@ def _short_column(name: str) -> str:
     return re.sub(r"(rotation|translation)_(?=\w*(deg|m)$)", "", name)
 
 
+def choose_photograph(scene_map: Any) -> None:
+    """Show a file chooser that localizes photographs of one's own in an open `Map`; nothing without a live notebook."""
+    from IPython.display import display
+
+    if TEXT_BARS in os.environ:
+        return
+    import ipywidgets
+
+    chooser = ipywidgets.FileUpload(description="photograph", accept="image/*")
+    focal = ipywidgets.FloatText(description="focal [px]", tooltip="0: from the EXIF tags of the file")
+    out = ipywidgets.Output()
+
+    def localize(_: Any) -> None:
+        out.clear_output()
+        with out, TemporaryDirectory() as folder:
+            (chosen,) = chooser.value
+            file = Path(folder) / Path(chosen["name"]).name
+            file.write_bytes(chosen["content"])
+            try:
+                result = scene_map.locate(scene_map.query(file, _camera_of(file, focal.value)))
+                display(result, result.show(), result.show_3d())
+            except errors.ToolkitError as error:
+                print(error)
+
+    chooser.observe(localize, "value")
+    display(ipywidgets.HBox([chooser, focal]), out)
+
+
+def _camera_of(file: Path, focal_px: float) -> Any:
+    """Return a camera without distortion by its focal length; None for 0."""
+    import pycolmap
+
+    from toolkit.capture.images import stored_size
+
+    if focal_px <= 0:
+        return None
+    width, height = stored_size(file)
+    return pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=width, height=height, params=[focal_px, width / 2, height / 2]
+    )
+
+
+_STATUSES = ("ok", "low_confidence", "failed")
+_BALANCES = {"images": ("embedded", "unreadable"), "queries": _STATUSES, "frames": _STATUSES}
+"""Counts that are the sums of others: what a stage was asked for, and what became of it."""
+
+
 def finish(table: "pd.DataFrame | None" = None, **counts: Any) -> None:
     """Display a notebook's counts and hand them to the pipeline, with the peak memory of this process.
 
     Args:
         table: the stage's table; rows with a `reason` count as left out.
         **counts: what the stage did, e.g. `images=120`.
+
+    Raises:
+        AssertionError: counts that belong together do not balance, see `_BALANCES`.
     """
     import resource
 
@@ -210,6 +285,10 @@ def finish(table: "pd.DataFrame | None" = None, **counts: Any) -> None:
     unit = 2**20 if sys.platform == "darwin" else 2**10  # bytes on macOS, kilobytes elsewhere
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
     plain = {name: value.item() if hasattr(value, "item") else value for name, value in counts.items()}
+    for total, parts in _BALANCES.items():
+        if {total, *parts} <= plain.keys():
+            done = sum(plain[name] for name in parts)
+            assert plain[total] == done, f"{total} were lost: {done} of {plain[total]} have a result"
     text = f"{counts_text(plain)}; peak memory {peak:.0f} MB"
     content = {**plain, "peak_memory_mb": round(peak, 1)}
     if table is not None:
@@ -219,8 +298,8 @@ def finish(table: "pd.DataFrame | None" = None, **counts: Any) -> None:
 
 
 def notebook_path(stage: str) -> Path:
-    """Return the notebook of a stage, `<number>_<stage>.ipynb`."""
-    path = next(iter(sorted(NOTEBOOKS.glob(f"[0-9]*_{stage}.ipynb"))), None)
+    """Return the notebook of a stage, `<number>_<stage>.ipynb`, or `start.ipynb`."""
+    path = next(iter(sorted([*NOTEBOOKS.glob(f"[0-9]*_{stage}.ipynb"), *NOTEBOOKS.glob(f"{stage}.ipynb")])), None)
     if path is None:
         do = "Install the toolkit in a clone of its repository: `pip install --editable .`."
         raise ManifestError.at(NOTEBOOKS, f"no notebook for the stage {stage}", do=do)
@@ -265,16 +344,14 @@ _RESULTS, _CACHES = ("embeddings", "retrieval", "reranked", "poses"), ("features
 """Folders that notebooks by hand take from a run. Caches are taken once: stages find in them what still fits."""
 
 
-def _take_from_run(stage: str, files: SceneFiles) -> None:
+def _take_from_run(stage: str, files: SceneFiles, run: Path | None) -> None:
     """Fill the folder of notebooks by hand, as far as no notebook has made results there, with hard links.
 
-    They lead to results of a finished run of the scene: the run called `<scene>`, or else the latest one. If that run
-    changes, its new results are taken.
+    They lead to results of a finished run. If that run changes, its new results are taken.
     """
     taken, made_here = read_json(files.root / _TAKEN), files.of_stage(stage)
     if made_here is not None:
         taken.pop(made_here.name, None)  # the links stay until the stage replaces them; from now on they are its own
-    run = _finished_run(files.run.parent, files.scene)
     for name in (*_RESULTS, *_CACHES):
         target = files.root / name
         if run is None or target == made_here or (target.exists() and name not in taken):
@@ -290,31 +367,32 @@ def _take_from_run(stage: str, files: SceneFiles) -> None:
 
 
 def _finished_run(runs: Path, scene: str) -> Path | None:
-    """Return the run of a scene from which notebooks by hand take results; None if there is none."""
+    """Return the run called `<scene>`, or else the latest finished run of the scene; None if there is none."""
     records = {path.parent: read_json(path) for path in sorted(runs.glob(f"*/{RECORD}"))}
     with_scene = [run for run, record in records.items() if scene in record.get("scenes", ())]
     return max(with_scene, key=lambda run: (run.name == scene, str(records[run].get("created"))), default=None)
 
 
-def _make_upstream(stage: str, sessions: Path, files: SceneFiles, folders: set[Path | None]) -> None:
+def _make_upstream(
+    stage: str, sessions: Path, files: SceneFiles, folders: set[Path | None], run: Path | None
+) -> None:
     """Run the earlier stages whose results `stage` needs and whose folder is in `folders` and empty or absent."""
     for name in UPSTREAM[stage]:
         folder = files.of_stage(name)
         if folder is None or name in OPTIONAL or folder not in folders:
             continue
-        _make_upstream(name, sessions, files, {files.of_stage(earlier) for earlier in UPSTREAM[name]})
+        _make_upstream(name, sessions, files, {files.of_stage(earlier) for earlier in UPSTREAM[name]}, run)
         if not (folder.is_dir() and any(folder.iterdir())):
             print(f"{name}: no results yet, running it now into {folder}")
         elif older := older_files(folder, name):
             print(f"{next(iter(older.values()))} Running it now.")
         else:
             continue
-        _run_stage(name, sessions, files)
+        _run_stage(name, sessions, files, run)
 
 
-def _run_stage(stage: str, sessions: Path, files: SceneFiles) -> None:
+def _run_stage(stage: str, sessions: Path, files: SceneFiles, run: Path | None) -> None:
     """Run `embed`, `retrieve` or `localize` with the settings of the run that results are taken from, or defaults."""
-    run = _finished_run(files.run.parent, files.scene)
     content = read_json(run / RECORD).get("manifest", {}) if run else {}
     manifest = Manifest.of(content or {"name": "by-hand", "captures": [str(sessions.parent)]})
     folders = {

@@ -49,11 +49,15 @@ from toolkit.manifest import (
 )
 from toolkit.models.weights import WeightsSource, check_weights, find_weights, resolve_weights
 from toolkit.notebook import (
+    DEMO_RUN,
+    NOTEBOOKS,
     UPSTREAM,
     Say,
     StatusLine,
+    check_given,
     check_names,
     execute,
+    find_run,
     handed_counts,
     notebook_parameters,
     notebook_path,
@@ -61,9 +65,10 @@ from toolkit.notebook import (
 )
 from toolkit.prediction.architectures import ARCHITECTURES
 from toolkit.runs.cluster import open_cluster
-from toolkit.runs.folder import LOG, OLDER, RunLog, counts_text, failures, held, warnings_of_kernels
+from toolkit.runs.folder import LOG, OLDER, RECORD, RunLog, counts_text, failures, held, warnings_of_kernels
 from toolkit.runs.kernel import Kernels
 from toolkit.runs.sweep import changed_keys, swept_runs, take_over, variant_name
+from toolkit.scene.run import Run
 from toolkit.sequences.pose_graph import require_gtsam
 
 log = logging.getLogger(__name__)
@@ -113,6 +118,21 @@ class Job:
         older = older_files(folder, self.stage) if row and folder else {}
         status = {"status": OLDER, "reason": next(iter(older.values()))} if older else {"status": "reused"}
         return {**row, **status} if row else None
+
+
+def open_run(folder: str | Path) -> Run:
+    """Open a run for a notebook, see `notebook.find_run`; the demo is run first if it has not been yet.
+
+    Raises:
+        ArtifactError: there is no such run; the message lists runs beside it.
+        ManifestError: a parameter of the notebook is wrong.
+    """
+    check_given("start")
+    path = find_run(folder)
+    demo = NOTEBOOKS.parent / "data_manifests" / "demo.yaml"
+    if not (path / RECORD).is_file() and path == (NOTEBOOKS.parent / DEMO_RUN).resolve():
+        run(demo)
+    return Run.open(path)
 
 
 def run(
@@ -419,6 +439,7 @@ def _job(manifest: Manifest, stage: str, capture: Path, files: SceneFiles, force
     """Return the job of a stage: the folders and pairs that its notebook has parameters for, and all its settings."""
     values: dict[str, Any] = {
         **{name: str(folder) for name, folder in files.folders(stage).items()},
+        "run": str(files.run),
         "sessions_root": str(capture / "sessions"),
         "queries": manifest.queries,
         **_selection(manifest, capture),
@@ -458,8 +479,8 @@ def _selection(manifest: Manifest, capture: Path) -> dict[str, Any]:
 
 def _inputs_of(job: Job, capture: str) -> str:
     """Return a fingerprint of a job's inputs: parameters, capture, code, weights, and the stages it builds on."""
-    # `skip_existing` does not change the results.
-    parameters = {name: value for name, value in job.parameters.items() if name != "skip_existing"}
+    # These two do not change the results.
+    parameters = {name: value for name, value in job.parameters.items() if name not in ("run", "skip_existing")}
     source = hashlib.sha256(notebook_path(job.stage).read_bytes()).hexdigest()
     upstream = [read_json(job.record.with_name(f"{stage}.json")).get("made") for stage in UPSTREAM[job.stage]]
     return fingerprint([parameters, table_record(), _files_of(job), capture, _code_fingerprint(), source, upstream])

@@ -201,7 +201,7 @@ def thumbnails(images: Iterable[Path | NDArray[np.uint8]], size: int = 110) -> s
         small = read_for_display(image, size) if isinstance(image, Path) else shrunk(image, size)
         _, data = cv2.imencode(".jpg", np.ascontiguousarray(small[..., ::-1]) if small.ndim == 3 else small)
         text = base64.b64encode(data.tobytes()).decode()
-        elements.append(f"<img src='data:image/jpeg;base64,{text}' alt='' style='margin:2px'>")
+        elements.append(f"<img src='data:image/jpeg;base64,{text}' alt='' style='display:inline-block;margin:2px'>")
     return "".join(elements)
 
 

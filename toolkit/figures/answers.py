@@ -131,7 +131,7 @@ class Answer:
         if self.error is not None:
             texts[f"true position error [{unit}]"] = _digits(self.error[1])
             texts["true rotation error [deg]"] = _digits(self.error[0])
-        return {**texts, "seconds": f"{self.result.seconds:.2f}"}
+        return texts | ({"seconds": f"{self.result.seconds:.2f}"} if np.isfinite(self.result.seconds) else {})
 
     @cached_property
     def details(self) -> QueryDetails:

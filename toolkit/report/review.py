@@ -13,8 +13,8 @@ from toolkit.figures.style import percent
 from toolkit.files import SceneFiles, map_record_path, pair_devices, read_map_record, write_text
 from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings, Settings
 from toolkit.pose.result import status_counts
+from toolkit.results.opening import read_settings
 from toolkit.results.pair import load_maps, map_files
-from toolkit.scene.opening import read_settings
 
 AnySettings = TypeVar("AnySettings", bound=Settings)
 PAIR = ["map_device", "query_device"]

@@ -690,7 +690,7 @@ def _canonical(pose: Floats) -> Floats:
 def localize_image(
     scene_map: Map,
     image: Image | Sequence[Image],
-    camera: pycolmap.Camera | Sequence[pycolmap.Camera],
+    camera: pycolmap.Camera | Sequence[pycolmap.Camera] | None = None,
     rig_from_cams: NDArray[np.float64] | None = None,
     turns: Sequence[int] | None = None,
     near: RoughPose | None = None,

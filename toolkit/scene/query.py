@@ -10,6 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from toolkit.capture.cameras import camera_text, parse_camera
+from toolkit.capture.images import exif_camera
 from toolkit.errors import CameraError, ImageError
 from toolkit.pose.base import Query, View
 
@@ -21,7 +22,7 @@ Image = Any
 
 def query_from(
     image: Image | Sequence[Image],
-    camera: pycolmap.Camera | Sequence[pycolmap.Camera],
+    camera: pycolmap.Camera | Sequence[pycolmap.Camera] | None = None,
     rig_from_cams: NDArray[np.float64] | None = None,
     turns: Sequence[int] | None = None,
 ) -> Query:
@@ -29,16 +30,22 @@ def query_from(
 
     Args:
         image: a file, or pixels as `pixels_from` takes them; for a rig, a sequence of C images.
-        camera: intrinsics, with the size of the image; for a rig, a sequence of C cameras.
+        camera: intrinsics, with the size of the image; for a rig, a sequence of C cameras. None: a guess from the
+            EXIF tags of the file, see `capture.images.exif_camera`.
         rig_from_cams: (C, 4, 4), for a rig.
         turns: for each image, the counter-clockwise quarter turns that bring gravity down; None: all are upright.
             Only learned embedders and networks use them.
 
     Raises:
-        ImageError: an image is neither a file nor pixels.
+        ImageError: an image is neither a file nor pixels, or has no camera and no focal length in EXIF.
         CameraError: an invalid camera, pose or turn. It is an ImageError.
     """
     images = list(image) if _are_several(image) else [image]
+    if camera is None:
+        files = [Path(one) for one in images if isinstance(one, str | Path)]
+        if len(files) < len(images):
+            raise CameraError("camera: found none for pixels. Only a file may do without, with a focal length in EXIF.")
+        camera = [exif_camera(file)[0] for file in files]
     cameras: list[Any] = list(camera) if isinstance(camera, list | tuple) else [camera]
     for intrinsics in cameras:
         _check_camera(intrinsics)

@@ -11,6 +11,7 @@ from urllib.parse import quote
 import pandas as pd
 
 from toolkit.capture import Capture, Session
+from toolkit.capture.devices import in_order
 from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles, pair_devices, read_json
 from toolkit.geometry import Ints
@@ -79,14 +80,16 @@ class Run:
         """Names of the captures that were localized."""
         return localized_scenes(self.path)
 
-    def map(self, device: str, scene: str | None = None) -> Map:
+    def map(self, device: str | None = None, scene: str | None = None) -> Map:
         """Open the map of a device, see `Map.open`.
 
         Args:
-            device: `ios`, `hl`, `spot`.
+            device: `ios`, `hl`, `spot`; None: the first that was localized in.
             scene: name of the capture; None: the only one of the run.
         """
-        return Map.open(self.path, self._scene(scene), device)
+        poses = SceneFiles(self.path, self._scene(scene)).poses_dir
+        devices = in_order(pair_devices(path.stem)[0] for path in pairs_of(poses))
+        return Map.open(self.path, self._scene(scene), device or (devices[0] if devices else "none"))
 
     def _scene(self, scene: str | None) -> str:
         if scene is None and len(self.scenes) != 1:
@@ -125,6 +128,18 @@ class Run:
 
         poses = SceneFiles(self.path, self._scene(scene)).poses_dir
         return WorstQueries(poses, map_device=map_device or "all").look(name).result
+
+    def best_query(self, map_device: str, scene: str | None = None) -> Query:
+        """Return the query that was localized in a map with the most inliers.
+
+        Raises:
+            ArtifactError: no query was localized in the map.
+        """
+        queries = self.queries
+        of_map = queries[(queries["map_device"] == map_device) & (queries["scene"] == self._scene(scene))]
+        if not len(of_map):
+            raise ArtifactError(f"{self.path}: no query was localized in the map of {map_device!r}.")
+        return self[str(of_map["image"].iloc[int(of_map["num_inliers"].argmax())]).partition(";")[0]]
 
     def report(self) -> "Page":
         """Return a link to the report, as a notebook shows it.
