@@ -288,6 +288,7 @@ def test_python_examples_run(
     retrieve_pairs(sessions, files.embeddings, files.retrieval_dir, map_device="ios", query_device="ios")
     where = (files.retrieval_dir, files.poses_dir, files.features, files.maps)
     localize_pairs(sessions, *where, map_device="ios", query_device="ios")
+    (files.run / "run.json").write_text("{}")
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
     for block in blocks(ROOT / "docs" / "api.md", "python"):
