@@ -170,6 +170,16 @@ def test_what_a_wrong_parameter_means_is_said(name: str, wrong: dict[str, Any], 
         notebook.check_values(name, wrong)
 
 
+def test_a_notebook_shows_an_error_without_frames_of_the_toolkit() -> None:
+    cell = compile("from toolkit.notebook import notebook_path\nnotebook_path('nonsense')", "<cell>", "exec")
+    with pytest.raises(ManifestError) as caught:
+        exec(cell, {})
+    sentence, *lines = caught.value._render_traceback_()
+    assert str(caught.value) in sentence
+    assert lines[-1].startswith("  cell, line 2")
+    assert not any("toolkit/notebook.py" in line for line in lines)
+
+
 @pytest.mark.slow
 def test_an_error_of_the_user_is_a_sentence_in_the_notebook_and_a_traceback_in_the_log(
     small_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -41,7 +41,7 @@ def test_without_an_evaluation_the_main_table_counts() -> None:
 def test_tables_are_written_as_csv_and_latex_and_removed_with_their_rows(tmp_path: Path) -> None:
     table = review.main_table(RECALL, QUERIES, [LIMIT])
     shown = pd.DataFrame({"map_1": ["a & b", "50 %"], "query": ["1°", "–"], "recall [%]": ["80 [38, 96]", "{x}"]})
-    paths = review.write_tables(tmp_path / "report-S", table, shown, "100 % of S_1")
+    paths = review.write_tables(tmp_path / "report-S", table, shown, "100 % of S")
     assert [path.name for path in paths] == ["report-S.csv", "report-S.tex"]
     with paths[0].open() as stream:
         rows = list(csv.DictReader(stream))
@@ -50,7 +50,7 @@ def test_tables_are_written_as_csv_and_latex_and_removed_with_their_rows(tmp_pat
     assert r"map\_1 & query & recall [\%] \\" in lines
     assert r"a \& b & 1\textdegree{} & 80 [38, 96] \\" in lines
     assert r"50 \% & -- & \{x\} \\" in lines
-    assert r"\caption{100 \% of S\_1}" in lines
+    assert r"\caption{100 \% of S}" in lines
     assert review.write_tables(tmp_path / "report-S", table.iloc[:0], shown, "") == []
     assert not list(tmp_path.iterdir())
 

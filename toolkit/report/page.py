@@ -368,7 +368,8 @@ def _table(frame: pd.DataFrame, caption: str, formats: Mapping[str, Write] = {},
     """Return a table as HTML, in a region that scrolls; empty if it has no rows.
 
     Args:
-        formats: functions that write the numbers of columns. Without one, a number has no decimals. Shares are shaded.
+        formats: functions that write the numbers of columns. Without one, a number has no decimals. Recall and
+            `percent` are shaded.
         bars: columns with bars behind their numbers.
     """
     from pandas.io.formats.style import Styler
@@ -380,7 +381,7 @@ def _table(frame: pd.DataFrame, caption: str, formats: Mapping[str, Write] = {},
     style.format(lambda value: f"{value:.0f}" if isinstance(value, float) else escape(value), na_rep="–")
     for name in frame.columns.intersection([*formats]):
         style.format(formats[name], subset=[name], na_rep="–")
-    style.map(_shade, subset=[name for name in frame if formats.get(name) in (percent, _share, _recall)])
+    style.map(_shade, subset=[name for name in frame if formats.get(name) in (percent, _recall)])
     style.map(lambda share: "color: var(--alarm)" if share > 0 else "", subset=frame.columns.intersection([OK_WRONG]))
     style.bar(subset=[name for name in bars if frame[name].max() > 0], color="#14629f40", vmin=0)
     texts = frame.drop(columns=[*formats], errors="ignore").select_dtypes(exclude="number").astype(str)
@@ -415,7 +416,7 @@ def _named(table: pd.DataFrame, thresholds: list[str]) -> tuple[pd.DataFrame, di
     formats: dict[str, Write] = {"median error [°]": number}
     formats |= {f"median error [{small}]": lambda length: number(factor * length)}
     formats |= dict.fromkeys(shares.values(), _recall)
-    formats |= {OK_WRONG: _unshaded, **dict.fromkeys(["time, median [s]", "time, 95 % [s]"], number)}
+    formats |= {OK_WRONG: _share, **dict.fromkeys(["time, median [s]", "time, 95 % [s]"], number)}
     return table.rename(columns=names), formats
 
 
@@ -474,8 +475,8 @@ def _losses(losses: pd.DataFrame) -> Markup:
     }
     table = pd.concat(sums, names=["threshold", "map"]).reset_index()
     table[[*metrics.REASONS]] = table[[*metrics.REASONS]].div(table["queries"], axis="index")
-    caption = "Queries missed at each threshold, and the share of all queries lost for each reason"
-    return _table(table, caption, dict.fromkeys(metrics.REASONS, _share))
+    caption = "Queries missed at each threshold, and the share of all queries lost for each reason [%]"
+    return _table(table, caption, dict.fromkeys(metrics.REASONS, percent))
 
 
 def _failures(queries: pd.DataFrame) -> Markup:
@@ -535,7 +536,7 @@ def _listed(queries: pd.DataFrame, caption: str, unit: str) -> Markup:
     table["inliers"] = queries["num_inliers"]
     names |= {"p_correct": "stated to be right", "rival_support": "support of a rival"}
     known = queries.filter([*names]).dropna(axis="columns", how="all").rename(columns=names)
-    formats: dict[str, Write] = dict.fromkeys(["stated to be right", "support of a rival"], _unshaded)
+    formats: dict[str, Write] = dict.fromkeys(["stated to be right", "support of a rival"], _share)
     names_of_images = queries["image"].fillna("").map(_shown_names)
     return _table(table.join(known).assign(image=names_of_images), caption, formats)
 
@@ -611,10 +612,6 @@ def _natural(path: Path) -> list[Any]:
 
 def _share(share: float) -> str:
     return f"{percent(share)}\N{NO-BREAK SPACE}%"
-
-
-def _unshaded(share: float) -> str:
-    return _share(share)
 
 
 def _length(length: float, unit: str) -> str:

@@ -7,6 +7,7 @@ from typing import NamedTuple, TypeVar
 
 import pandas as pd
 
+from toolkit.capture.devices import in_order
 from toolkit.errors import ArtifactError
 from toolkit.figures.evaluation import wilson_interval
 from toolkit.figures.style import percent
@@ -26,8 +27,7 @@ NAMES = {
     "simulated": "A simulation that knows the true poses",
 }  # fmt: skip
 """What papers call the parts that settings name."""
-LATEX = {"°": r"\textdegree{}", "\N{NO-BREAK SPACE}": "~", "–": "--", "∞": r"$\infty$", "&": r"\&", "%": r"\%",
-         "_": r"\_", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}"}  # fmt: skip
+LATEX = {"°": r"\textdegree{}", "\N{NO-BREAK SPACE}": "~", "–": "--", "∞": r"$\infty$"}
 
 
 class Interval(NamedTuple):
@@ -95,26 +95,24 @@ def write_tables(stem: Path, table: pd.DataFrame, shown: pd.DataFrame, caption: 
         for path in paths:
             path.unlink(missing_ok=True)
         return []
-    latex = shown.map(_latex).rename(columns=_latex).style.hide(axis="index")
-    label = f"tab:{stem.name}"
-    columns = "ll" + "r" * (len(shown.columns) - 2)
-    text = latex.to_latex(hrules=True, caption=_latex(caption), label=label, column_format=columns)
+    style = shown.style.hide(axis="index").format(escape="latex").format_index(escape="latex", axis="columns")
+    columns, escaped = "ll" + "r" * (len(shown.columns) - 2), caption.replace("%", r"\%")
+    text = style.to_latex(hrules=True, caption=escaped, label=f"tab:{stem.name}", column_format=columns)
+    for letter, command in LATEX.items():
+        text = text.replace(letter, command)
     write_text(paths[0], table.to_csv(index=False, float_format="%.6g"))
     write_text(paths[1], f"% \\usepackage{{booktabs}}\n{text}")
     return paths
-
-
-def _latex(text: object) -> str:
-    return "".join(LATEX.get(letter, letter) for letter in str(text))
 
 
 def maps_table(files: SceneFiles) -> pd.DataFrame:
     """Return a row for each map: its images, points, and observations of them, and whether its poses fit its images."""
     rows = []
     pairs = sorted(files.poses_dir.glob("*_map_*_query_*.h5"))
-    for device, h5 in {pair_devices(path.stem)[0]: path for path in pairs}.items():
+    h5_of = {pair_devices(path.stem)[0]: path for path in pairs}
+    for device in in_order(h5_of):
         try:
-            local_map = load_maps(map_files(files.maps, f"{device}_map", h5))
+            local_map = load_maps(map_files(files.maps, f"{device}_map", h5_of[device]))
         except ArtifactError:
             local_map = None
         record = read_map_record(map_record_path(files.poses_dir, files.scene, device))

@@ -13,6 +13,7 @@ from toolkit.capture.cameras import in_view, view_bounds
 from toolkit.files import image_name
 from toolkit.geometry import Floats, Ints, invert, pose_error, transform
 from toolkit.pose.result import Status, statuses
+from toolkit.runs.folder import counted
 
 if TYPE_CHECKING:
     import pycolmap
@@ -202,7 +203,7 @@ def camera_messages(session: "Session", tables: Sequence[pd.DataFrame]) -> list[
     for (name, column), found in fitted.items():
         if len(found) < posed[name] / 2:
             continue
-        file, median_of = f"{session.id}/sensors.txt", f"(median of {len(found)} poses)"
+        file, median_of = f"{session.id}/sensors.txt", f"(median of {counted(len(found), 'poses')})"
         fits_px, cameras = np.array([value for value, _ in found]), [session.camera(sensor) for _, sensor in found]
         if column == "focal_px":
             stated = np.array([camera.mean_focal_length() for camera in cameras])
