@@ -222,6 +222,7 @@ def demo_data(
     frames: Annotated[int, Option(min=2, help="Frames per room and map session.")] = 12,
     seed: Annotated[int, Option(min=0, help="Random seed; another seed gives other rooms.")] = 0,
     alike: Annotated[bool, Option("--alike", help="The last room looks exactly like the first.")] = False,
+    hard: Annotated[bool, Option("--hard", help="Add hard images: dark, blurred, torn, elsewhere, ...")] = False,
     seconds: Annotated[int, Option(min=0, help="Length of a query recording; adds odometry between images.")] = 0,
     losses: Annotated[int, Option(min=0, help="Tracking losses per query recording.")] = 0,
     gaps: Annotated[int, Option(min=0, help="Gaps of 4 s in the odometry of a query recording.")] = 0,
@@ -231,7 +232,7 @@ def demo_data(
     from toolkit.synthetic import render_capture
 
     capture = render_capture(
-        out, rooms, frames, seed, alike=alike, seconds=seconds, losses=losses, gaps=gaps, radio=radio
+        out, rooms, frames, seed, alike=alike, hard=hard, seconds=seconds, losses=losses, gaps=gaps, radio=radio
     )
     print(f"Capture: {capture}")
 

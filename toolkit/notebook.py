@@ -170,7 +170,7 @@ def sessions_or_demo(sessions_root: str | None) -> Path:
         return Path(sessions_root).expanduser().resolve()
     from toolkit.synthetic import render_capture
 
-    return render_capture(_root() / "data" / "demo", **DemoData().model_dump()) / "sessions"
+    return render_capture(_root() / "data" / "demo", **DemoData(hard=True).model_dump()) / "sessions"
 
 
 def own_folder(folder: str | None, scene: str, images: str | None = None) -> Path:

@@ -18,11 +18,12 @@ from benchmarks.common import scaled
 from toolkit.capture import Capture, read_depth
 from toolkit.capture import images as capture_images
 from toolkit.capture.check import check_capture
-from toolkit.errors import CaptureError, ManifestError
+from toolkit.capture.images import read_image
+from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.geometry import invert, make_pose, rotation_angle_deg, transform
 from toolkit.synthetic import capture as capture_writing
 from toolkit.synthetic import render_capture, textures
-from toolkit.synthetic.capture import World
+from toolkit.synthetic.capture import HARD, WRONG_FOCAL, World
 from toolkit.synthetic.devices import DEVICES, Sensor, looking, walks
 from toolkit.synthetic.recording import Emitter, emitters_of, odometry_of, received, scans
 from toolkit.synthetic.render import Rays, paint, render
@@ -418,6 +419,28 @@ def test_scans_of_wifi_have_what_the_format_asks_for() -> None:
 def test_a_short_recording_with_losses_has_a_map_of_few_images(tmp_path: Path) -> None:
     capture = render_bare(tmp_path / "SHORT", 2, 4, seed=5, alike=True, seconds=40, losses=3, gaps=1)
     assert not check_capture(capture).problems
+
+
+def test_hard_images_are_added_and_the_easy_ones_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(capture_writing, "build_room", coarse_room)
+    first, hard = (
+        render_capture(tmp_path / str(added), 1, 4, 0, hard=added, progress=False) for added in (False, True)
+    )
+    easy = {path.relative_to(first): path.read_bytes() for path in first.rglob("*.jpg")}
+    assert all((hard / path).read_bytes() == content for path, content in easy.items())
+    session = Capture.open(hard)["ios_query"]
+    added = {path.stem.partition("-")[2]: path for path in (hard / "sessions" / "ios_query").rglob("*-*.jpg")}
+    assert list(HARD) == [name for name in HARD if name in added]
+    assert len(session) == len(Capture.open(first)["ios_query"]) + len(HARD)
+    assert np.isfinite(session.world_from_cam(ground_truth=True)).all()
+    asked = session.keyframes("pruned_subsampled")
+    assert asked["timestamp"].isin(session.images["timestamp"].iloc[-len(HARD) :]).sum() == len(HARD), "all are queries"
+    with pytest.raises(ImageError, match="cannot be decoded"):
+        read_image(added["torn"])
+    wrong, right = (session.camera(session.images["sensor_id"].iloc[row]) for row in (-3, -7))
+    assert wrong.params[0] == pytest.approx(WRONG_FOCAL * right.params[0], rel=0.02)
+    assert read_image(added["night"]).mean() < 0.1 * read_image(added["two-places"]).mean()
+    assert read_image(added["covered"]).std() < 2
 
 
 def test_refusals(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import ctypes
 import json
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -28,7 +28,7 @@ from toolkit.synthetic.devices import DEVICES, Device, Sensor, walks
 from toolkit.synthetic.recording import PICTURE_S, RADIOS, RATE_HZ, emitters_of, every_frame, scans, tracked
 from toolkit.synthetic.render import Rays, paint, render
 from toolkit.synthetic.scene import Quad, Scene, build_room, named_rng
-from toolkit.synthetic.textures import Image
+from toolkit.synthetic.textures import Image, Rng
 
 if TYPE_CHECKING:
     import pycolmap
@@ -61,6 +61,39 @@ class World(DemoData):
     def build(self, index: int) -> Scene:
         """Return a room without textures."""
         return build_room(self.seed, index, self.look(index))
+
+
+def _night(picture: Image, rng: Rng) -> Image:
+    """Underexpose a picture, with the noise of a high gain."""
+    return np.clip(0.05 * picture + 4 * rng.standard_normal(picture.shape) + 0.5, 0, 255).astype(np.uint8)
+
+
+def _shaken(picture: Image, rng: Rng, length: int) -> Image:
+    """Blur a picture along a line of `length` pixels, 17 degrees from the horizontal."""
+    reach = 0.5 * (length - 1) * np.array([np.cos(0.3), np.sin(0.3)])
+    middle, kernel = length // 2, np.zeros((length, length), np.float32)
+    start, end = (np.round(middle + side * reach).astype(int).tolist() for side in (-1, 1))
+    cv2.line(kernel, start, end, 1.0)
+    return cv2.filter2D(picture, -1, kernel / kernel.sum())
+
+
+def _covered(picture: Image, rng: Rng) -> Image:
+    return np.full_like(picture, 6)
+
+
+HARD: dict[str, Callable[[Image, Rng], Image] | None] = {
+    "night": _night,
+    "blurred": partial(_shaken, length=33),
+    "two-places": None,
+    "torn": None,
+    "wrong-focal": None,
+    "covered": _covered,
+    "elsewhere": None,
+}
+"""Hard images of a phone: what each is called, and what is done to an image of the easy queries. `two-places`: the
+right half shows another room, as a large screen would. `torn`: the end of the file is missing. `wrong-focal`: a camera
+of its own, whose focal length is stated `WRONG_FOCAL` times too long. `elsewhere`: a room that is in no map."""
+WRONG_FOCAL = 1.12
 
 
 @dataclass
@@ -198,6 +231,54 @@ def _save(path: Path, image: Image, options: list[int]) -> None:
     path.write_bytes(encoded.tobytes())
 
 
+def _add_hard(sessions: Path, world: World, table: Tables, elsewhere: Scene) -> None:
+    """Add a recording of hard images to the phone's query session.
+
+    The phone walks through the first room again, there and back: its images are those of the easy queries, changed as
+    `HARD` says, with their true poses. The last one is taken in another room, a few seconds later.
+
+    Args:
+        elsewhere: a painted room that is in no map.
+    """
+    import pycolmap
+
+    device, raw = DEVICES["ios"], sessions / "ios_query" / "raw_data"
+    subsession, start = _subsession("ios", "query", 2, world.hours)
+    table.subsessions[subsession] = start
+    easy = [(table.sensors[row[1]], row[2], image[2]) for row, image in zip(table.poses, table.images, strict=True)]
+    there = world.queries - world.queries // 2
+    way = [*range(there), *reversed(range(there, world.queries))]
+    for number, (name, worsen) in enumerate(HARD.items()):
+        timestamp = start + round(1e6 * (PICTURE_S * (number + 1) + (6 if name == "elsewhere" else 0)))
+        (_, _, *sensor), pose, source = easy[way[number % len(way)]]
+        sensor_id = f"{subsession}/{'cam_wide' if name == 'wrong-focal' else 'cam_phone'}_{timestamp}"
+        path = f"{subsession}/images/{timestamp}-{name}.jpg"
+        if name == "elsewhere":
+            pose = walks(elsewhere, world.seed, world.rooms, world.frames, "ios")["query", 0][0]
+            pose = pose @ device.sensors[0].body_from_cam
+            _, model, width, height, *params = sensor
+            camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
+            shot = Shot("ios_query", timestamp, sensor_id, path, None, camera, pose, device)
+            _take(shot, elsewhere.quads, None, sessions, world.seed)
+        else:
+            if name == "wrong-focal":
+                sensor[4:6] = [round(WRONG_FOCAL * focal, 3) for focal in sensor[4:6]]
+            picture = cv2.imread(str(raw / source))
+            assert picture is not None
+            if worsen is not None:
+                picture = worsen(picture, named_rng(world.seed, "hard", name))
+            if name == "two-places":
+                half = picture.shape[1] // 2
+                picture[:, half:] = cv2.imread(str(raw / easy[-1][2]))[:, half:]
+            _save(raw / path, picture, [cv2.IMWRITE_JPEG_QUALITY, device.quality])
+            if name == "torn":
+                whole = (raw / path).read_bytes()
+                (raw / path).write_bytes(whole[: len(whole) // 3])
+        table.sensors[sensor_id] = (sensor_id, f"phone camera for {name}", *sensor)
+        table.poses.append((timestamp, sensor_id, pose))
+        table.images.append((timestamp, sensor_id, path))
+
+
 def _poses_between(table: Tables, world: World, name: str) -> list[tuple[int, str, Floats]]:
     """Return the poses of all frames of recordings of length `world.seconds`. Only some frames have images."""
     poses = []
@@ -247,8 +328,10 @@ def _write_session(path: Path, world: World, table: Tables, rooms: list[Scene]) 
             )
     odometry = Trajectory.from_poses(times[kept], np.array(ids, object)[kept].tolist(), measured[kept])
     frames = pd.DataFrame(pictured, columns=["timestamp", "device_id"])
-    pruned = frames[np.arange(len(frames)) % 6 != 5]
-    subsampled = pruned[np.arange(len(pruned)) % 3 != 1]
+    # Hard images are the last ones, and all of them are queries.
+    hard = np.arange(len(frames)) >= len(frames) - len(HARD) * (world.hard and path.name == "ios_query")
+    pruned = frames[(np.arange(len(frames)) % 6 != 5) | hard]
+    subsampled = pruned[(np.arange(len(pruned)) % 3 != 1) | hard[pruned.index]]
     keyframes = {"original": frames, "pruned": pruned, "pruned_subsampled": subsampled}
     write_session(
         path,
@@ -330,17 +413,22 @@ def _render_sessions(out: Path, world: World, progress: bool) -> None:
     sessions = out / "sessions"
     tables = {f"{name}_{split}": Tables() for name in DEVICES for split in ("map", "query")}
     images = world.rooms * sum(len(d.sensors) for d in DEVICES.values()) * (world.frames + world.queries)
+    images += len(HARD) * world.hard
     rays: dict[tuple[float, ...], Rays] = {}
     with (
         tqdm(total=images, desc="render", unit="image", disable=not progress) as bar,
         ThreadPoolExecutor(default_workers()) as pool,  # a thread may need 150 MB
     ):
         try:
-            for index in range(world.rooms):
+            for index in range(world.rooms + world.hard):
                 scene = world.build(index)
                 paint_quad = partial(paint, scene, world.seed, world.look(index))
                 for _ in pool.map(paint_quad, range(len(scene.quads))):
                     pass
+                if index == world.rooms:
+                    _add_hard(sessions, world, tables["ios_query"], scene)
+                    bar.update(len(HARD))
+                    break
                 tasks = []
                 for shot in _plan_room(world, scene, index, tables):
                     key = tuple(shot.camera.params)
