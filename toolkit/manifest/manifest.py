@@ -44,7 +44,7 @@ class DemoData(Settings):
     """Make the last room look exactly like the first."""
     hard: bool = False
     """Add a query recording of the phone with hard images: by night, blurred, with a wrong focal length, of two
-    places, of a room that is in no map, covered, and torn."""
+    places, of a room that is in no map, and torn."""
     seconds: Natural = 0
     """Length of each query recording in seconds, with odometry also between images; 0: as long as its images take."""
     losses: Natural = 0

@@ -77,17 +77,12 @@ def _shaken(picture: Image, rng: Rng, length: int) -> Image:
     return cv2.filter2D(picture, -1, kernel / kernel.sum())
 
 
-def _covered(picture: Image, rng: Rng) -> Image:
-    return np.full_like(picture, 6)
-
-
 HARD: dict[str, Callable[[Image, Rng], Image] | None] = {
     "night": _night,
     "blurred": partial(_shaken, length=33),
     "two-places": None,
     "torn": None,
     "wrong-focal": None,
-    "covered": _covered,
     "elsewhere": None,
 }
 """Hard images of a phone: what each is called, and what is done to an image of the easy queries. `two-places`: the
