@@ -1,11 +1,12 @@
 """The pose graph of odometry and single queries."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.sequences.drifting import drive
+from tests.sequences.drifting import drive, small_motion
 from toolkit import geometry
 from toolkit.errors import ManifestError
 from toolkit.manifest import SequenceSettings
@@ -34,6 +35,20 @@ def test_wrong_queries_are_not_used_and_harm_nothing() -> None:
     assert rotation_deg.max() < 1.0
     assert position_m.max() < 0.3
     assert set(placed.status) == {"ok"}
+
+
+def test_odometry_does_not_pull_poses_that_are_better_than_it() -> None:
+    """It did: poses good to 0.3 mm got the noise of the odometry, as all poses counted as good to 1 cm at best."""
+    rng = np.random.default_rng(0)
+    way = drive(rng)
+    noise = np.stack([small_motion(rng, np.deg2rad(0.003), 0.0003) for _ in way.queries.frames])
+    poses = way.world_from_rig[way.queries.frames] @ noise
+    covariances = np.tile(np.diag(np.repeat([np.deg2rad(0.003), 0.0003], 3) ** 2), (len(poses), 1, 1))
+    queries = replace(way.queries, world_from_rig=poses, covariances=covariances)
+    placed = place_piece(way.odometry, queries, SETTINGS)
+    _, alone = geometry.pose_error(poses, way.world_from_rig[queries.frames])
+    _, joined = geometry.pose_error(placed.world_from_rig[queries.frames], way.world_from_rig[queries.frames])
+    assert np.median(joined) < 1.15 * np.median(alone)
 
 
 def test_the_stated_covariance_is_as_large_as_the_errors() -> None:
