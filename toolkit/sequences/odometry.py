@@ -19,7 +19,7 @@ from toolkit.geometry import Floats, Ints
 from toolkit.manifest import SequenceSettings
 
 LEAST_STD_M, LEAST_STD_DEG = 0.001, 0.005
-"""Standard deviation by axis that is added to every single query's pose; its covariance has the noise of the map already.
+"""Standard deviation by axis that is added to each single pose, whose covariance has the noise of the map already.
 With ten times as much, odometry pulled the poses of an exact map by 0.5 mm in the median, twice their error."""
 JUMP_M, JUMP_DEG = 0.2, 20.0
 """Tracking was lost if a step is further than this from all steps that the largest acceleration allows."""
