@@ -1,6 +1,7 @@
 """The visualize stage: recordings and still pictures of a scene, from the files of earlier stages."""
 
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import product
@@ -202,7 +203,7 @@ def _draw_worst(path: Path, scene: str, candidates: pd.DataFrame) -> None:
     """Draw the worst queries of all pairs; `candidates` are the rows of `_draw_pair`."""
     shown = []
     for _, row in candidates.iloc[worst_first(candidates)[:WORST]].iterrows():
-        has_matches, reason = row["details"].has_matches, [row["status"]]
+        has_matches, reason = row["details"].has_matches, [textwrap.shorten(row["status"], 72, placeholder=" …")]
         if has_matches and pd.notna(row.get("num_matches")):
             reason.append(f"{row['num_matches']:.0f} matches")
         if has_matches or row.get("num_inliers", 0) > 0:

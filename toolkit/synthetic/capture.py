@@ -249,7 +249,7 @@ def _add_hard(sessions: Path, world: World, table: Tables, elsewhere: Scene) -> 
         sensor_id = f"{subsession}/{'cam_wide' if name == 'wrong-focal' else 'cam_phone'}_{timestamp}"
         path = f"{subsession}/images/{timestamp}-{name}.jpg"
         if name == "elsewhere":
-            pose = walks(elsewhere, world.seed, world.rooms, world.frames, "ios")["query", 0][0]
+            pose = walks(elsewhere, world.seed, world.rooms, world.frames, "ios")["query", 0][-1]
             pose = pose @ device.sensors[0].body_from_cam
             _, model, width, height, *params = sensor
             camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
