@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import sys
 import traceback
@@ -65,6 +66,9 @@ _FAILED = (
     "recall counts a missing pose as a miss, so a rough pose cannot reduce it, and the submission is complete. The "
     "description gives the number of such queries, and submission.csv lists them. `leave-out`: nothing."
 )
+_SOURCES = "Image files, folders of images (a camera each) and videos; the last one is the folder of the new capture."
+_HELD_OUT = "Every Nth photograph becomes a query with truth, and the map is run and evaluated on them; 0: none."
+_DISTANCE = "Meters between two points, given by a pixel each, or between the cameras of two images."
 _TABLE = "CSV with a header: image; qw,qx,qy,qz,tx,ty,tz for poses; camera_id, or model,width,height,params."
 
 
@@ -295,6 +299,50 @@ def import_transforms(
 
     for report in import_transforms(transforms, capture, device, split, placing, axes, unit, hold_out):
         print(report.text())
+
+
+@app.command()
+def reconstruct(
+    sources: Annotated[list[Path], Argument(metavar="PHOTOS... CAPTURE", help=_SOURCES)],
+    device: Device = "ios",
+    hold_out: Annotated[int, Option(metavar="N", help=_HELD_OUT)] = 0,
+    fps: Annotated[float | None, Option(help="Frames per second of a video; default: chosen by motion.")] = None,
+    camera: Annotated[
+        str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all photographs; else estimated.")
+    ] = None,
+    distance: Annotated[
+        tuple[str, str, float] | None, Option(metavar="IMAGE:X,Y IMAGE:X,Y METERS", help=_DISTANCE)
+    ] = None,
+    positions: Annotated[Path | None, Option(help="CSV: image,x,y,z, known camera centers in meters.")] = None,
+    mapper: Annotated[str, Option(metavar="incremental|global", help="COLMAP's mapper.")] = "incremental",
+    placing: Placing = "link",
+) -> None:
+    """Make a map from photographs or videos without poses, by structure from motion."""
+    from toolkit import pipeline
+    from toolkit.capture import Capture
+    from toolkit.exchange.new_manifest import new_manifest
+    from toolkit.exchange.reconstruct import FOLDER, reconstruct
+    from toolkit.figures.explore import draw_top_view
+
+    if len(sources) < 2:
+        raise ManifestError("reconstruct: expected photographs and then the folder of the new capture.")
+    *photos, capture = sources
+    manifest = Path("data_manifests") / f"{re.sub(r'[^A-Za-z0-9._-]', '-', capture.resolve().name)}.yaml"
+    if manifest.exists() and str(capture) not in manifest.read_text(encoding="utf-8"):
+        raise ManifestError(f"{manifest} is about another capture. Rename it, or give {capture} another name.")
+    result = reconstruct(photos, capture, device, hold_out, fps, camera, distance, positions, mapper, placing)
+    print(result.text())
+    picture = capture / FOLDER / "cameras.png"
+    draw_top_view(Capture.open(capture)).savefig(picture)
+    print(f"Picture: {picture}")
+    if not manifest.exists():
+        new_manifest(manifest.stem, capture)
+    print(f"Manifest: {manifest}")
+    if hold_out:
+        print(f"Report: {pipeline.run(manifest) / 'report.html'}")
+    else:
+        print(f"Import queries: python -m toolkit import images QUERIES {capture} --device {device}")
+        print(f"Then run it: python -m toolkit run {manifest}")
 
 
 @export_app.command("colmap")
