@@ -333,7 +333,7 @@ def reconstruct(
     result = reconstruct(photos, capture, device, hold_out, fps, camera, distance, positions, mapper, placing)
     print(result.text())
     picture = capture / FOLDER / "cameras.png"
-    draw_top_view(Capture.open(capture)).savefig(picture)
+    draw_top_view(Capture.open(capture), points=result.points, colors=result.colors).savefig(picture)
     print(f"Picture: {picture}")
     if not manifest.exists():
         new_manifest(manifest.stem, capture)

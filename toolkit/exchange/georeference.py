@@ -17,6 +17,7 @@ from toolkit.geometry import Floats, make_pose
 MAX_ERRORS_M = (0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Limits of the error of a known position; the smallest that `MOST` of the positions meet is used."""
 MOST = 0.6
+OUTLIER = 2.5  # smallest error of an outlier, in multiples of the median; for Gaussian noise, 3.8 standard deviations
 MAX_SCALE_DEVIATION = 0.1  # largest relative standard deviation of a scale that is used
 MAX_TILT_DEG = 2.0  # largest standard deviation of the vertical by known positions; else the cameras tell it
 NEAR_PX = 0.02  # largest distance of a point's observations from the given pixel, in multiples of the image's width
@@ -106,15 +107,15 @@ def fit(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, Floats, float, 
             break
     else:
         return None
-    inliers = np.asarray(found["inlier_mask"], bool)
-    a, b = source[inliers], target[inliers]
-    new_from_old = pycolmap.estimate_sim3d(a, b) or found["tgt_from_src"]
-
-    def errors() -> Floats:
-        return np.asarray(np.linalg.norm(new_from_old * a - b, axis=1))
-
+    new_from_old = found["tgt_from_src"]
+    for _ in range(3):
+        errors = np.linalg.norm(new_from_old * source - target, axis=1)
+        inliers = errors <= max(OUTLIER * np.median(errors), 1e-9)
+        a, b = source[inliers], target[inliers]
+        new_from_old = pycolmap.estimate_sim3d(a, b) or new_from_old
+    errors = np.linalg.norm(new_from_old * a - b, axis=1)
     spread = np.linalg.svd(b - b.mean(axis=0), compute_uv=False)
-    sigma = np.sqrt((errors() ** 2).sum() / max(3 * len(a) - 7, 1))
+    sigma = np.sqrt((errors**2).sum() / max(3 * len(a) - 7, 1))
     level = bool(np.degrees(sigma / max(spread[1], 1e-9)) < MAX_TILT_DEG)
     if not level:  # rotate about z only
         from_plane, to_plane = ((points - points.mean(axis=0))[:, :2] @ [1, 1j] for points in (a, b))
@@ -123,9 +124,9 @@ def fit(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, Floats, float, 
         rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
         shift = b.mean(axis=0) - abs(turn) * rotation @ a.mean(axis=0)
         new_from_old = pycolmap.Sim3d(abs(turn), pycolmap.Rotation3d(rotation), shift)
-    residual = errors()
-    sigma = np.sqrt((residual**2).sum() / max(3 * len(a) - 7, 1))
-    return new_from_old, inliers, float(np.median(residual)), float(sigma / max(np.linalg.norm(spread), 1e-9)), level
+        errors = np.linalg.norm(new_from_old * a - b, axis=1)
+        sigma = np.sqrt((errors**2).sum() / max(3 * len(a) - 5, 1))
+    return new_from_old, inliers, float(np.median(errors)), float(sigma / max(np.linalg.norm(spread), 1e-9)), level
 
 
 def read_positions(path: Path) -> dict[str, Floats]:

@@ -137,7 +137,7 @@ def choose_frames(video: Path, fps: float | None = None) -> Iterator[tuple[int, 
     Raises:
         CaptureError: OpenCV cannot read the video.
     """
-    reader = cv2.VideoCapture(str(video), cv2.CAP_ANY, [cv2.CAP_PROP_ORIENTATION_AUTO, 0])
+    reader = cv2.VideoCapture(str(video))
     total, rate = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)), reader.get(cv2.CAP_PROP_FPS) or 30.0
     found, best, score, start, reference = 0, None, -1.0, 0, None
     for number in tqdm(range(max(total, 1)), desc=video.name, unit="frame"):

@@ -8,7 +8,8 @@ database, and all models in COLMAP's format. The capture gets the largest model.
 import json
 import logging
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Session, parse_camera
@@ -36,10 +38,12 @@ from toolkit.features.matching import (
 )
 from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import FeatureStore, extract_session, match_sessions
+from toolkit.features.verification import epipolar_matches
 from toolkit.files import IMPORTED, link_folder, write_text
 from toolkit.geometry import Floats, Ints, make_pose, unit
 from toolkit.manifest import LocalizeSettings
 from toolkit.store.items import Items, heals
+from toolkit.threads import one_thread
 
 log = logging.getLogger(__name__)
 
@@ -59,6 +63,8 @@ class Reconstruction:
 
     reports: list[ImportReport]
     record: dict[str, Any]
+    points: Floats  # (P, 3) in the world
+    colors: NDArray[np.uint8]  # (P, 3) RGB
     notes: list[str] = field(default_factory=list)
 
     def text(self) -> str:
@@ -164,29 +170,24 @@ class _Work:
         named = [(self.names[i], self.names[j]) for i, j in pairs]
         stored = match_sessions((store, store), named, method.matcher, self.folder / "matches", (self.session.id,) * 2)
         keypoints = lru_cache(512)(lambda image: self.keypoints(image, kind))
-        options = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_INLIERS)
-        options.ransac.random_seed = 0
 
         def verify(pair: tuple[int, int]) -> tuple[int, Ints]:
-            i, j = pair
-            if self.names[i] not in store or self.names[j] not in store:
+            names = [self.names[image] for image in pair]
+            if not all(name in store for name in names):
                 return 0, np.zeros((0, 2), np.int64)
-            indices = stored[self.names[i], self.names[j]].indices
-            if len(indices) < MIN_INLIERS:
-                return len(indices), indices[:0]
-            cameras = [self.cameras[self.camera_of[image]] for image in pair]
-            found = pycolmap.estimate_two_view_geometry(
-                cameras[0], keypoints(i), cameras[1], keypoints(j), indices.astype(np.uint32), options
-            )
-            config = pycolmap.TwoViewGeometryConfiguration
-            bad = found.config in (config.UNDEFINED, config.DEGENERATE, config.WATERMARK)
-            return len(indices), indices[:0] if bad else np.asarray(found.inlier_matches, np.int64)
+            matches = stored[names[0], names[1]]
+            ends = []
+            for image, indices in zip(pair, matches.indices.T, strict=True):
+                camera = self.cameras[self.camera_of[image]]
+                ends += [(camera.width, camera.height), keypoints(image)[indices]]
+            return len(matches), matches.indices[epipolar_matches(*ends, matches.scores, tests=len(pairs))]
 
-        bar = tqdm(prefetch(verify, pairs, default_workers()), "verify", len(pairs), unit="pair")
-        for pair, (count, inliers) in zip(pairs, bar, strict=True):
-            self.matched[pair] = max(count, self.matched.get(pair, 0))
-            if len(inliers) >= MIN_INLIERS:
-                self.pairs[kind][pair] = inliers
+        with one_thread():
+            bar = tqdm(prefetch(verify, pairs, default_workers()), "verify", len(pairs), unit="pair")
+            for pair, (count, inliers) in zip(pairs, bar, strict=True):
+                self.matched[pair] = max(count, self.matched.get(pair, 0))
+                if len(inliers) >= MIN_INLIERS:
+                    self.pairs[kind][pair] = inliers
 
     def inliers(self) -> Ints:
         """(N, N) numbers of verified matches."""
@@ -359,7 +360,9 @@ def reconstruct(
             f"{size} in {folder_of_models / str(number)}" for number, size in enumerate(sizes[1:], start=1)
         )
         notes.append(f"{len(sizes) - 1} other models do not connect to it: {where}")
-    return Reconstruction(reports, record, [*notes, *placed.notes])
+    points = list(model.points3D.values())
+    xyz, rgb = np.array([point.xyz for point in points]), np.array([point.color for point in points], np.uint8)
+    return Reconstruction(reports, record, xyz.reshape(-1, 3), rgb.reshape(-1, 3), [*notes, *placed.notes])
 
 
 def _escalate(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> list[str]:
