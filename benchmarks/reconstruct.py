@@ -1,4 +1,4 @@
-"""Photographs without poses to a model: `toolkit reconstruct` beside COLMAP's own pipeline, on the same files and cores.
+"""Photographs without poses to a model: `toolkit reconstruct` beside COLMAP's own pipeline, on the same files.
 
     python benchmarks/reconstruct.py [--capture PATH]... [--images FOLDER --truth CSV] [--threads 2] [--only TEXT]
                                      [--methods toolkit,global,colmap] [--out FILE]
@@ -26,7 +26,7 @@ Sets = dict[str, tuple[Path, dict[str, Floats]]]
 
 
 def sets_of_capture(path: Path, folder: Path) -> Sets:
-    """Link the images of each recording of each map session; return each folder, and its true world_from_cam by name."""
+    """Link the images of each recording of a map; return the folders, and true world_from_cam by name."""
     from toolkit.capture import Capture
 
     sets: Sets = {}

@@ -93,7 +93,7 @@ def test_gps_of_a_model() -> None:
 
 def test_too_few_or_too_close_positions_give_no_meters() -> None:
     model = synthetic()
-    two = {name: (0.0, 0.0, 0.0) for name in list(centers(model))[:2]}
+    two = dict.fromkeys(list(centers(model))[:2], (0.0, 0.0, 0.0))
     assert placed(model, two).unit is None
     rng = np.random.default_rng(0)
     noise = {name: rng.normal(size=3) * 3 for name in centers(model)}

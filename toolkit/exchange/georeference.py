@@ -94,7 +94,7 @@ def place(
 
 
 def fit(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, Floats, float, float, bool] | None:
-    """Fit a similarity to positions (N, 3) with outliers; z is up in both, which is kept if the positions do not tell it.
+    """Fit a similarity to positions (N, 3) with outliers; z is up in both, and stays so if they do not tell it better.
 
     Returns:
         target_from_source, inliers (N,), the median of their errors, the relative standard deviation of the scale, and
@@ -191,7 +191,7 @@ def _point(model: pycolmap.Reconstruction, images: Mapping[str, pycolmap.Image],
     near = [seen[index] for index in np.argsort(away, kind="stable")[:5] if away[index] < NEAR_PX * image.camera.width]
     if not near:
         raise ManifestError(
-            f"distance: no point of the model near {text}. Choose a corner or a pattern, not a plain area."
+            f"distance: the model has no point near {text}. Choose a corner or a pattern, no plain area."
         )
     depths = np.array([(image.cam_from_world() * model.points3D[point.point3D_id].xyz)[2] for point in near])
     if depths.max() > MAX_DEPTHS * depths.min():

@@ -41,7 +41,7 @@ from toolkit.features.stores import FeatureStore, extract_session, match_session
 from toolkit.features.verification import epipolar_matches
 from toolkit.files import IMPORTED, link_folder, write_text
 from toolkit.geometry import Floats, Ints, make_pose, unit
-from toolkit.manifest import LocalizeSettings
+from toolkit.manifest import LocalizeSettings, SiftSettings
 from toolkit.store.items import Items, heals
 from toolkit.threads import one_thread
 
@@ -54,6 +54,10 @@ NEIGHBORS, SIMILAR = 10, 20  # else each photograph with so many next ones in it
 MIN_INLIERS = 15  # of a pair that counts
 MIN_MODEL = 3  # photographs of a model
 ESCALATED = 8  # pairs of each photograph that SIFT leaves out, which are tried with learned features
+RATIO = 0.8  # of SIFT's matches; fewer of them are wrong than with the larger one for queries
+LOSS_PX, MAX_ERROR_PX, MIN_ANGLE_DEG = 0.5, 4.0, 1.5
+"""Of the last bundle adjustment: scale of the Cauchy loss and largest error of an observation, in pixels of the image
+where features are detected, and smallest triangulation angle."""
 _BATCH = 64  # pairs that are matched at once
 
 
@@ -243,6 +247,10 @@ class _Work:
             else:
                 options = pycolmap.IncrementalPipelineOptions(min_model_size=MIN_MODEL, random_seed=0)
                 options.num_threads = default_workers()
+                # Less precise on the way than COLMAP's defaults, in half of the time, as `_refine` follows.
+                options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
+                options.ba_global_function_tolerance = options.ba_local_function_tolerance = 1e-4
+                options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
                 if self.fixed:
                     options.ba_refine_focal_length = options.ba_refine_extra_params = False
                     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
@@ -250,7 +258,23 @@ class _Work:
                     database, images, out, options,
                     initial_image_pair_callback=lambda: bar.update(2), next_image_callback=bar.update,
                 )  # fmt: skip
+            for model in models.values():
+                self._refine(model)
         return sorted(models.values(), key=lambda model: -model.num_reg_images())
+
+    def _refine(self, model: pycolmap.Reconstruction) -> None:
+        """Adjust poses, points and cameras under a robust loss, which halves errors (STRECHA), and drop outliers."""
+        scale = max(
+            1.0, max(max(camera.width, camera.height) for camera in self.cameras) / SiftSettings().max_long_side
+        )
+        options = pycolmap.BundleAdjustmentOptions(print_summary=False, min_track_length=2)
+        options.refine_focal_length = options.refine_extra_params = not self.fixed
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.loss_function_scale = LOSS_PX * scale
+        options.ceres.solver_options.max_num_iterations = 50
+        for _ in range(2):
+            pycolmap.bundle_adjustment(model, options)
+            pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX * scale, MIN_ANGLE_DEG)
 
 
 @contextmanager
@@ -308,7 +332,7 @@ def reconstruct(
         raise CaptureError(f"{sources[0]}: no photograph can be read. First: {next(iter(unreadable.items()))}")
     work = _Work(folder, device, photographs, given)
     work.unusable |= unreadable
-    work.extract(LocalMethod("sift", SiftExtractor(), _Mutual.of(KINDS["sift"])), range(len(work)))
+    work.extract(LocalMethod("sift", SiftExtractor(), _Mutual(RATIO, shorten=KINDS["sift"].shorten)), range(len(work)))
     work.match(0, work.choose_pairs())
     models = work.map(mapper)
     notes = _escalate(work, models)
