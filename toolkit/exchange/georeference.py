@@ -195,10 +195,9 @@ def _point(model: pycolmap.Reconstruction, images: Mapping[str, pycolmap.Image],
         )
     depths = np.array([(image.cam_from_world() * model.points3D[point.point3D_id].xyz)[2] for point in near])
     if depths.max() > MAX_DEPTHS * depths.min():
-        raise ManifestError(
-            f"distance: points near {text} are at depths that differ by {100 * (depths.max() / depths.min() - 1):.0f} %. "
-            "Choose a pixel away from edges of objects."
-        )
+        apart = 100 * (depths.max() / depths.min() - 1)
+        found = f"distance: points near {text} are at depths that differ by {apart:.0f} %"
+        raise ManifestError(f"{found}. Choose a pixel away from edges of objects.")
     ray = np.asarray(image.camera.cam_from_img(xy[None]))[0]
     return np.asarray(world_from_cam * (np.append(ray, 1.0) * np.median(depths)))
 

@@ -50,11 +50,9 @@ def gather(sources: Sequence[Path], made: Path, fps: float | None = None) -> tup
         CaptureError: a source is missing or is no image or video, or two photographs would have one name.
     """
     photographs, unreadable = list[Photograph](), dict[str, str]()
-    for name, path in _files(sources, made, fps):
-        if any(name == other.name for other in photographs[-1:]) or name in unreadable:
-            raise CaptureError(f"{path}: a second photograph named {name}. Rename it or its folder.")
+    for name, source in _files(sources, made, fps):
         try:
-            name, path = _converted(name, path, made)
+            name, path = _converted(name, source, made)
             _, exif = read_header(path)
             photographs.append(Photograph(name, path, exif, _position(path)))
         except ImageError as error:
@@ -99,7 +97,7 @@ def _converted(name: str, path: Path, made: Path) -> tuple[str, Path]:
 
                 pillow_heif.register_heif_opener()
             with PIL.Image.open(path) as image:
-                exif, pixels = image.getexif(), image.convert("RGB")
+                pixels, exif = image.convert("RGB"), image.getexif()  # in this order: Pillow turns a TIFF upright
             with write_atomic(target) as temporary:
                 pixels.save(temporary, exif=exif)
         except ModuleNotFoundError:
@@ -156,7 +154,7 @@ def choose_frames(video: Path, fps: float | None = None) -> Iterator[tuple[int, 
             best, score = (number, np.asarray(frame, np.uint8), gray), sharp
         if share >= 1 and best is not None:
             yield best[0], best[1]
-            start, reference, best, score = best[0], best[2], None, -1.0
+            start, reference, best, score = number, best[2], None, -1.0
     reader.release()
     if not found:
         raise CaptureError(f"{video}: no frame can be read. Convert it to H.264 in an .mp4 file.")

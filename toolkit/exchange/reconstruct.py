@@ -58,6 +58,7 @@ RATIO = 0.8  # of SIFT's matches; fewer of them are wrong than with the larger o
 LOSS_PX, MAX_ERROR_PX, MIN_ANGLE_DEG = 0.5, 4.0, 1.5
 """Of the last bundle adjustment: scale of the Cauchy loss and largest error of an observation, in pixels of the image
 where features are detected, and smallest triangulation angle."""
+FEW_PAIRS, STRONGEST = 100, 2048  # if there are more pairs, only so many SIFT features of each photograph are matched
 _BATCH = 64  # pairs that are matched at once
 
 
@@ -76,13 +77,22 @@ class Reconstruction:
 
 
 class _Mutual(MutualMatcher):
-    """`MutualMatcher` with a thread per core."""
+    """`MutualMatcher` of the strongest features, with a thread per core."""
 
     batch_size = _BATCH
 
+    strongest: int | None = None
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {**super().settings, "strongest": self.strongest}
+
     def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
         distinct = {id(features): features for pair in pairs for features in pair}
-        units = {key: unit_descriptors(features.descriptors, self.shorten) for key, features in distinct.items()}
+        units = {
+            key: unit_descriptors(features.descriptors[: self.strongest], self.shorten)
+            for key, features in distinct.items()
+        }
         return list(prefetch(lambda pair: self.match_unit(*(units[id(one)] for one in pair)), pairs, default_workers()))
 
 
@@ -272,8 +282,12 @@ class _Work:
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = LOSS_PX * scale
         options.ceres.solver_options.max_num_iterations = 50
+        config = pycolmap.BundleAdjustmentConfig()
+        for number in model.reg_image_ids():
+            config.add_image(number)
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         for _ in range(2):
-            pycolmap.bundle_adjustment(model, options)
+            pycolmap.create_default_bundle_adjuster(options, config, model).solve()
             pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX * scale, MIN_ANGLE_DEG)
 
 
@@ -322,6 +336,7 @@ def reconstruct(
     splits = ("map", "query") if hold_out else ("map",)
     drafts = [start(capture, device, split, folder, placing) for split in splits]
     photographs, unreadable = gather(list(map(Path, sources)), folder / "images", fps)
+    known = read_positions(Path(positions)) if positions is not None else None
     given = None
     if camera is not None:
         try:
@@ -332,8 +347,11 @@ def reconstruct(
         raise CaptureError(f"{sources[0]}: no photograph can be read. First: {next(iter(unreadable.items()))}")
     work = _Work(folder, device, photographs, given)
     work.unusable |= unreadable
-    work.extract(LocalMethod("sift", SiftExtractor(), _Mutual(RATIO, shorten=KINDS["sift"].shorten)), range(len(work)))
-    work.match(0, work.choose_pairs())
+    matcher = _Mutual(RATIO, shorten=KINDS["sift"].shorten)
+    work.extract(LocalMethod("sift", SiftExtractor(), matcher), range(len(work)))
+    pairs = work.choose_pairs()
+    matcher.strongest = STRONGEST if len(pairs) > FEW_PAIRS else None
+    work.match(0, pairs)
     models = work.map(mapper)
     notes = _escalate(work, models)
     if len(work.kinds) > 1 and any(work.pairs[1]):
@@ -343,7 +361,6 @@ def reconstruct(
         raise CaptureError(f"{sources[0]}: no two of {len(work)} photographs fit together. {worst}.")
     model = models[0]
     geo = {item.name: item.geo for item in work.photographs if item.geo is not None}
-    known = read_positions(Path(positions)) if positions is not None else None
     placed = place(model, {item.name: item.quarter_turns for item in work.photographs}, geo, distance, known)
     folder_of_models = folder / "models"
     for number, each in enumerate(models):
