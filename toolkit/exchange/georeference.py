@@ -102,7 +102,7 @@ def fit(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, Floats, float, 
     """
     for max_error in MAX_ERRORS_M:
         options = pycolmap.RANSACOptions(max_error=max_error, random_seed=0)
-        found = pycolmap.estimate_sim3d_robust(source, target, options)
+        found: Any = pycolmap.estimate_sim3d_robust(source, target, options)
         if found is not None and found["num_inliers"] >= max(3, MOST * len(source)):
             break
     else:
@@ -185,10 +185,11 @@ def _point(model: pycolmap.Reconstruction, images: Mapping[str, pycolmap.Image],
         )
     if not colon:
         return np.asarray(image.projection_center())
-    world_from_cam = image.cam_from_world().inverse()
+    camera, world_from_cam = image.camera, image.cam_from_world().inverse()
+    assert camera is not None
     seen = [point for point in image.points2D if point.has_point3D()]
     away = np.linalg.norm(np.array([point.xy for point in seen]).reshape(-1, 2) - xy, axis=1)
-    near = [seen[index] for index in np.argsort(away, kind="stable")[:5] if away[index] < NEAR_PX * image.camera.width]
+    near = [seen[index] for index in np.argsort(away, kind="stable")[:5] if away[index] < NEAR_PX * camera.width]
     if not near:
         raise ManifestError(
             f"distance: the model has no point near {text}. Choose a corner or a pattern, no plain area."
@@ -198,7 +199,7 @@ def _point(model: pycolmap.Reconstruction, images: Mapping[str, pycolmap.Image],
         apart = 100 * (depths.max() / depths.min() - 1)
         found = f"distance: points near {text} are at depths that differ by {apart:.0f} %"
         raise ManifestError(f"{found}. Choose a pixel away from edges of objects.")
-    ray = np.asarray(image.camera.cam_from_img(xy[None]))[0]
+    ray = np.asarray(camera.cam_from_img(xy[None]))[0]
     return np.asarray(world_from_cam * (np.append(ray, 1.0) * np.median(depths)))
 
 

@@ -137,14 +137,18 @@ def choose_frames(video: Path, fps: float | None = None) -> Iterator[tuple[int, 
     """
     reader = cv2.VideoCapture(str(video))
     total, rate = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)), reader.get(cv2.CAP_PROP_FPS) or 30.0
-    found, best, score, start, reference = 0, None, -1.0, 0, None
+    found, score, start = 0, -1.0, 0
+    best: tuple[int, NDArray[np.uint8], NDArray[np.uint8]] | None = None
+    reference: NDArray[np.uint8] | None = None
     for number in tqdm(range(max(total, 1)), desc=video.name, unit="frame"):
         ok, frame = reader.read()
         if not ok:
             break
         found += 1
         size = _SMALL, max(1, round(_SMALL * frame.shape[0] / frame.shape[1]))
-        gray = cv2.resize(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), size, interpolation=cv2.INTER_AREA)
+        gray = np.asarray(
+            cv2.cvtColor(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY), np.uint8
+        )
         if reference is None:  # the first frame opens the video
             share = 1.0
         else:
@@ -163,7 +167,7 @@ def choose_frames(video: Path, fps: float | None = None) -> Iterator[tuple[int, 
 def _motion(before: NDArray[np.uint8], now: NDArray[np.uint8]) -> float:
     """Return the median motion of corners between two gray frames, in multiples of the width; inf if they are lost."""
     corners = cv2.goodFeaturesToTrack(before, 150, 0.01, 7)
-    if corners is None:  # nothing to see
+    if corners is None or not len(corners):  # nothing to see
         return 0.0
     moved, found, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, np.zeros_like(corners))
     kept = found.ravel() == 1
@@ -191,7 +195,7 @@ def initial_cameras(
         for folder in set(folders)
     }
     keys: dict[Any, int] = {}
-    numbers, cameras = [], []
+    numbers, cameras = list[int](), list[pycolmap.Camera]()
     for index, (item, size, folder) in enumerate(zip(photographs, sizes, folders, strict=True)):
         tags = tuple(str(item.exif.get(tag, "")) for tag in EXIF_CAMERA)
         key = folder, size, tags, index if mixed[folder] and not any(tags) else None

@@ -158,7 +158,7 @@ class _Work:
         rows = [row for row, name in enumerate(self.names) if name in store]
         vectors[rows] = list(prefetch(lambda name: vlad.embed([store[name]])[0], names, default_workers()))
         vectors = unit(vectors, 1e-9)
-        similarity = vectors @ vectors.T
+        similarity = (vectors @ vectors.T).astype(np.float64)
         np.fill_diagonal(similarity, -1)
         return similarity
 
@@ -190,11 +190,11 @@ class _Work:
             if not all(name in store for name in names):
                 return 0, np.zeros((0, 2), np.int64)
             matches = stored[names[0], names[1]]
-            ends = []
-            for image, indices in zip(pair, matches.indices.T, strict=True):
-                camera = self.cameras[self.camera_of[image]]
-                ends += [(camera.width, camera.height), keypoints(image)[indices]]
-            return len(matches), matches.indices[epipolar_matches(*ends, matches.scores, tests=len(pairs))]
+            cameras = [self.cameras[self.camera_of[image]] for image in pair]
+            sizes = [(camera.width, camera.height) for camera in cameras]
+            a, b = (keypoints(image)[indices] for image, indices in zip(pair, matches.indices.T, strict=True))
+            inliers = epipolar_matches(sizes[0], a, sizes[1], b, matches.scores, tests=len(pairs))
+            return len(matches), matches.indices[inliers]
 
         with one_thread():
             bar = tqdm(prefetch(verify, pairs, default_workers()), "verify", len(pairs), unit="pair")
@@ -252,18 +252,10 @@ class _Work:
         images = self.session.path.parent
         with tqdm(total=len(self), desc="map", unit="image") as bar, _quiet():
             if mapper == "global":
-                options = pycolmap.GlobalPipelineOptions(min_model_size=MIN_MODEL, random_seed=0)
-                models = pycolmap.global_mapping(database, images, out, options)
+                chosen = pycolmap.GlobalPipelineOptions(min_model_size=MIN_MODEL, random_seed=0)
+                models = pycolmap.global_mapping(database, images, out, chosen)
             else:
-                options = pycolmap.IncrementalPipelineOptions(min_model_size=MIN_MODEL, random_seed=0)
-                options.num_threads = default_workers()
-                # Less precise on the way than COLMAP's defaults, in half of the time, as `_refine` follows.
-                options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
-                options.ba_global_function_tolerance = options.ba_local_function_tolerance = 1e-4
-                options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
-                if self.fixed:
-                    options.ba_refine_focal_length = options.ba_refine_extra_params = False
-                    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+                options = self._incremental_options()
                 models = pycolmap.incremental_mapping(
                     database, images, out, options,
                     initial_image_pair_callback=lambda: bar.update(2), next_image_callback=bar.update,
@@ -271,6 +263,18 @@ class _Work:
             for model in models.values():
                 self._refine(model)
         return sorted(models.values(), key=lambda model: -model.num_reg_images())
+
+    def _incremental_options(self) -> pycolmap.IncrementalPipelineOptions:
+        """Return options that are less precise on the way than COLMAP's, in half of the time, as `_refine` follows."""
+        options = pycolmap.IncrementalPipelineOptions(min_model_size=MIN_MODEL, random_seed=0)
+        options.num_threads = default_workers()
+        options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
+        options.ba_global_function_tolerance = options.ba_local_function_tolerance = 1e-4
+        options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
+        if self.fixed:
+            options.ba_refine_focal_length = options.ba_refine_extra_params = False
+            options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+        return options
 
     def _refine(self, model: pycolmap.Reconstruction) -> None:
         """Adjust poses, points and cameras under a robust loss, which halves errors (STRECHA), and drop outliers."""
