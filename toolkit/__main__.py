@@ -341,7 +341,7 @@ def reconstruct(
     if hold_out:
         print(f"Report: {pipeline.run(manifest) / 'report.html'}")
     else:
-        print(f"Import queries: python -m toolkit import images QUERIES {capture} --device {device}")
+        print(f"Import queries: python -m toolkit import images QUERIES {capture} --device {device}{result.camera}")
         print(f"Then run it: python -m toolkit run {manifest}")
 
 

@@ -138,6 +138,7 @@ def test_nothing_fits(tmp_path: Path) -> None:
     ("options", "error"),
     [
         ({"hold_out": 1}, ManifestError),
+        ({"hold_out": 9}, ManifestError),
         ({"mapper": "magic"}, ManifestError),
         ({"camera": "PINHOLE, 10"}, ManifestError),
         ({"positions": "missing.csv"}, CaptureError),

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Session, parse_camera
+from toolkit.capture.cameras import camera_text
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.embedders.vlad import Vlad
 from toolkit.errors import CaptureError, ManifestError, WeightsError
@@ -72,7 +73,10 @@ class Reconstruction:
     colors: NDArray[np.uint8]  # (P, 3) RGB
     notes: list[str] = field(default_factory=list)
 
+    camera: str = ""  # option for queries of the same camera, if the photographs have one
+
     def text(self) -> str:
+        """Return what was made, as text."""
         return "\n".join([*self.notes, *(report.text() for report in self.reports)])
 
 
@@ -245,7 +249,7 @@ class _Work:
         return path
 
     def map(self, mapper: str = "incremental") -> list[pycolmap.Reconstruction]:
-        """Return the models, the largest first."""
+        """Return the models, the largest first; of the others, those that have a photograph that it lacks."""
         database, out = self.write_database(), self.folder / "models"
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
@@ -260,9 +264,12 @@ class _Work:
                     database, images, out, options,
                     initial_image_pair_callback=lambda: bar.update(2), next_image_callback=bar.update,
                 )  # fmt: skip
-            for model in models.values():
+            ordered = sorted(models.values(), key=lambda model: -model.num_reg_images())
+            inside = {image for model in ordered[:1] for image in model.reg_image_ids()}
+            kept = ordered[:1] + [model for model in ordered[1:] if not {*model.reg_image_ids()} <= inside]
+            for model in tqdm(kept, "refine", unit="model"):
                 self._refine(model)
-        return sorted(models.values(), key=lambda model: -model.num_reg_images())
+        return kept
 
     def _incremental_options(self) -> pycolmap.IncrementalPipelineOptions:
         """Return options that are less precise on the way than COLMAP's, in half of the time, as `_refine` follows."""
@@ -349,6 +356,8 @@ def reconstruct(
             raise ManifestError(f"camera: {error}") from None
     if not photographs:
         raise CaptureError(f"{sources[0]}: no photograph can be read. First: {next(iter(unreadable.items()))}")
+    if hold_out > len(photographs):
+        raise ManifestError(f"hold-out: found {hold_out}, but there are {len(photographs)} photographs.")
     work = _Work(folder, device, photographs, given)
     work.unusable |= unreadable
     matcher = _Mutual(RATIO, shorten=KINDS["sift"].shorten)
@@ -367,8 +376,9 @@ def reconstruct(
     geo = {item.name: item.geo for item in work.photographs if item.geo is not None}
     placed = place(model, {item.name: item.quarter_turns for item in work.photographs}, geo, distance, known)
     folder_of_models = folder / "models"
+    shutil.rmtree(folder_of_models)
     for number, each in enumerate(models):
-        (folder_of_models / str(number)).mkdir(exist_ok=True)
+        (folder_of_models / str(number)).mkdir(parents=True)
         each.write(str(folder_of_models / str(number)))
     sensors = {
         camera_id: f"{SUBSESSION}/cam_{number}" for number, camera_id in enumerate(sorted(model.cameras), start=1)
@@ -407,12 +417,14 @@ def reconstruct(
         notes.append(f"{len(sizes) - 1} other models do not connect to it: {where}")
     points = list(model.points3D.values())
     xyz, rgb = np.array([point.xyz for point in points]), np.array([point.color for point in points], np.uint8)
-    return Reconstruction(reports, record, xyz.reshape(-1, 3), rgb.reshape(-1, 3), [*notes, *placed.notes])
+    notes += placed.notes
+    option = f" --camera '{camera_text(next(iter(model.cameras.values())))}'" if len(model.cameras) == 1 else ""
+    return Reconstruction(reports, record, xyz.reshape(-1, 3), rgb.reshape(-1, 3), notes, option)
 
 
 def _escalate(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> list[str]:
-    """Match the photographs that the largest model lacks with learned features, each with those that look similar."""
-    inside = {image.name for image in models[0].images.values() if image.has_pose} if models else set()
+    """Match the photographs that are in no model with learned features, each with those that look similar."""
+    inside = {image.name for model in models for image in model.images.values() if image.has_pose}
     left = [image for image, name in enumerate(work.names) if name not in inside and name in work.kinds[0][1]]
     if not left:
         return []
