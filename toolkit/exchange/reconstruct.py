@@ -275,6 +275,7 @@ class _Work:
         """Return options that are less precise on the way than COLMAP's, in half of the time, as `_refine` follows."""
         options = pycolmap.IncrementalPipelineOptions(min_model_size=MIN_MODEL, random_seed=0)
         options.num_threads = default_workers()
+        options.structure_less_registration_fallback = False
         options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
         options.ba_global_function_tolerance = options.ba_local_function_tolerance = 1e-4
         options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
