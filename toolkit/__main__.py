@@ -117,6 +117,64 @@ def run(
 
 
 @app.command()
+def localize(
+    run: Run,
+    photographs: Annotated[list[Path], Argument(help="Image files.")],
+    device: Annotated[str, Option(help="Map device.")] = "ios",
+    scene: Annotated[str | None, Option(help="Capture; default: the run's only one.")] = None,
+    camera: Annotated[
+        str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics; default: estimated from the matches.")
+    ] = None,
+    picture: Annotated[Path | None, Option(help="Image file to write: the map and the poses, from above.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Localize photographs in the map of a run, which is not changed."""
+    import numpy as np
+
+    from toolkit.capture import parse_camera
+    from toolkit.errors import CameraError, reason_of
+    from toolkit.geometry import qt_from_pose
+    from toolkit.scene import Run as FinishedRun
+    from toolkit.scene import localize_image
+
+    try:
+        given = None if camera is None else parse_camera("camera", camera)
+    except ValueError as error:
+        raise CameraError(f"camera: {error}") from None
+    place = FinishedRun.open(run).map(device, scene)
+    rows, poses = [], [np.full((4, 4), np.nan)]
+    for path in photographs:
+        row: dict[str, Any] = {"image": str(path), "status": "", "world_from_cam": None}
+        try:
+            result = localize_image(place, path, given)
+            row |= {"status": result.status_text, "inliers": result.num_inliers, "remark": result.remark}
+            if result.world_from_rig is not None:
+                poses.append(result.world_from_rig)
+                row |= {"world_from_cam": result.world_from_rig.tolist(), "position_std_m": result.position_std_m}
+        except ToolkitError as error:
+            row["status"] = f"failed: {reason_of(error, f'localize {path}')}"
+        rows.append(row)
+        if not as_json:
+            print(f"{path}: {row['status']}. {row.get('remark', '')}")
+            if row["world_from_cam"] is not None:
+                qw, qx, qy, qz, *xyz = qt_from_pose(np.array(row["world_from_cam"])).tolist()
+                print(f"  position {xyz[0]:.3f} {xyz[1]:.3f} {xyz[2]:.3f}, qw qx qy qz "
+                      f"{qw:.5f} {qx:.5f} {qy:.5f} {qz:.5f}, {row['inliers']} inliers")  # fmt: skip
+    if picture is not None:
+        from toolkit.figures.top_view import draw_scene
+
+        points, colors = np.zeros((0, 3)), None
+        for mapped in place.mapped[:1]:
+            points, colors = mapped.map.points, mapped.map.colors
+        found, true, title = np.stack(poses), np.full((len(poses), 4, 4), np.nan), "Photographs in the map, from above"
+        unit = ("m" if place.capture.unit else "unknown unit", 1.0)
+        draw_scene(points, colors, place.session.world_from_cam(), found, true, title=title, unit=unit).savefig(picture)
+        print(f"Picture: {picture}", file=sys.stderr if as_json else sys.stdout)
+    if as_json:
+        _print_json({"run": str(run), "photographs": rows})
+
+
+@app.command()
 def compare(
     runs: Annotated[list[Path], Argument(help="Two or more run folders, compared with the first.")],
     out: Annotated[Path | None, Option(help="HTML file; default: compare_<names>.html by the first run.")] = None,

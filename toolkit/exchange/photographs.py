@@ -16,11 +16,11 @@ from toolkit.capture.images import EXIF_CAMERA, HEADER_ERRORS, ORIENTATION, exif
 from toolkit.errors import CaptureError, ImageError
 from toolkit.exchange.drafts import IMAGE_SUFFIXES, list_images
 from toolkit.files import write_atomic
+from toolkit.scene.query import FOCAL_PRIOR
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 OTHER_SUFFIXES = (".webp", ".tif", ".tiff", ".bmp", ".gif", ".jp2", ".heic", ".heif", ".avif")
 """Formats that are converted to PNG; HEIC needs the package pillow-heif."""
-FOCAL_PRIOR = 1.2  # focal length of a camera that nothing is known of, in multiples of the longer side
 STEP = 0.06  # motion of the image between chosen frames of a video, in multiples of its width
 _SMALL = 320  # width of the frames whose motion is measured, pixels
 _GPS = 0x8825
