@@ -695,12 +695,15 @@ def test_a_picture_without_a_camera_that_tells_nothing(opened: Map) -> None:
 
 
 def test_photographs_on_the_command_line(opened: Map, small_capture: Path, tmp_path: Path) -> None:
-    session, run = Capture.open(small_capture)["ios_query"], opened.files
-    assert run is not None
+    session = Capture.open(small_capture)["ios_query"]
+    assert opened.files is not None
+    run = tmp_path / "run"
+    shutil.copytree(opened.files.run, run)
+    (run / "run.json").write_text("{}")
     photo = str(session.image_path(0))
     camera = camera_text(session.camera(session.images["sensor_id"].iloc[0]))
-    command = ["localize", str(run.run), photo, str(tmp_path / "nowhere.jpg"), "--camera", camera, "--json"]
-    before = snapshot(run.run)
+    command = ["localize", str(run), photo, str(tmp_path / "nowhere.jpg"), "--camera", camera, "--json"]
+    before = snapshot(run)
     result = CliRunner().invoke(app, [*command, "--picture", str(tmp_path / "above.png")])
     assert result.exit_code == 0
     answer, missing = json.loads(result.stdout)["photographs"]
@@ -710,7 +713,7 @@ def test_photographs_on_the_command_line(opened: Map, small_capture: Path, tmp_p
         np.testing.assert_array_equal(answer["world_from_cam"], expected.world_from_rig)
     assert missing["status"].startswith("failed: ImageError")
     assert (tmp_path / "above.png").stat().st_size > 0
-    assert snapshot(run.run) == before
+    assert snapshot(run) == before
 
 
 def snapshot(folder: Path) -> dict[str, tuple[int, int]]:

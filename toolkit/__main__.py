@@ -397,7 +397,8 @@ def reconstruct(
         new_manifest(manifest.stem, capture)
     print(f"Manifest: {manifest}")
     if hold_out:
-        print(f"Report: {pipeline.run(manifest) / 'report.html'}")
+        run_dir = pipeline.run(manifest)
+        print(f"Report: {run_dir / 'report.html'}\nLocalize more: python -m toolkit localize {run_dir} PHOTOGRAPH")
     else:
         print(f"Import queries: python -m toolkit import images QUERIES {capture} --device {device}{result.camera}")
         print(f"Then run it: python -m toolkit run {manifest}")
