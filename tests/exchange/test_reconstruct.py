@@ -222,6 +222,9 @@ def test_frames_of_a_video_move_and_are_sharp(tmp_path: Path) -> None:
     assert len(list(choose_frames(video, fps=2))) == pytest.approx(12, abs=1)
     names = [item.name for item in gather([video], tmp_path / "made", 1)[0]]
     assert names[0].startswith("walk/frame_")
+    for fps in (None, 1):  # the frames of another rate are replaced
+        again = [item.name for item in gather([video], tmp_path / "made", fps)[0]]
+        assert (again == names) == (fps == 1)
     (tmp_path / "torn.mp4").write_bytes(b"no video")
     with pytest.raises(CaptureError, match=r"torn\.mp4"):
         list(choose_frames(tmp_path / "torn.mp4"))

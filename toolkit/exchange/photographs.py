@@ -104,7 +104,7 @@ def _converted(name: str, path: Path, made: Path) -> tuple[str, Path]:
             raise ImageError("HEIC cannot be read: pip install pillow-heif, or convert it to JPEG") from None
         except HEADER_ERRORS as error:
             raise ImageError(f"cannot be read as an image ({error})") from None
-    return target.name if "/" not in name else f"{name}.png", target
+    return f"{name}.png", target
 
 
 # Videos
@@ -115,7 +115,7 @@ def _frames(video: Path, made: Path, prefix: str, fps: float | None) -> Iterator
     folder = made / prefix
     done = folder / f".{'motion' if fps is None else fps}-{video.stat().st_mtime_ns}"
     if not done.exists():
-        for old in folder.glob("*.jpg"):
+        for old in [*folder.glob("*.jpg"), *folder.glob(".*-*")]:
             old.unlink()
         for number, frame in choose_frames(video, fps):
             with write_atomic(folder / f"frame_{number:06d}.jpg") as temporary:
