@@ -54,7 +54,7 @@ ALL_PAIRS = 60  # up to this number of photographs, all pairs are matched
 NEIGHBORS, SIMILAR = 10, 20  # else each photograph with so many next ones in its folder, and so many that look similar
 MIN_INLIERS = 15  # of a pair that counts
 MIN_MODEL = 3  # photographs of a model
-ESCALATED = 8  # pairs of each photograph that SIFT leaves out, which are tried with learned features
+ESCALATED = 6  # similar ones of each photograph that SIFT leaves out, with which learned features are tried
 RATIO = 0.8  # of SIFT's matches; fewer of them are wrong than with the larger one for queries
 LOSS_PX, MAX_ERROR_PX, MIN_ANGLE_DEG = 0.5, 4.0, 1.5
 """Of the last bundle adjustment: scale of the Cauchy loss and largest error of an observation, in pixels of the image
@@ -424,7 +424,10 @@ def reconstruct(
 
 
 def _escalate(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> list[str]:
-    """Match the photographs that are in no model with learned features, each with those that look similar."""
+    """Match the photographs that are in no model with learned features, each with those that look similar.
+
+    These are matched with each other, too, where SIFT has: only points of two other photographs tell a pose.
+    """
     inside = {image.name for model in models for image in model.images.values() if image.has_pose}
     left = [image for image, name in enumerate(work.names) if name not in inside and name in work.kinds[0][1]]
     if not left:
@@ -439,8 +442,9 @@ def _escalate(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> list[st
         return [f"photographs that SIFT leaves out were not tried with ALIKED: {error}"]
     pairs = set[tuple[int, int]]()
     for image in left:
-        others = np.argsort(-work.similarity[image], kind="stable")[:ESCALATED]
-        pairs |= {(min(image, other), max(image, other)) for other in others.tolist() if other != image}
+        others = np.argsort(-work.similarity[image], kind="stable")[:ESCALATED].tolist()
+        pairs |= {(min(image, other), max(image, other)) for other in others if other != image}
+        pairs |= {pair for pair in work.pairs[0] if {*pair} <= {*others}}
     work.extract(method, sorted({image for pair in pairs for image in pair}))
     work.match(1, sorted(pairs))
     return [f"{len(left)} photographs that SIFT left out were tried with ALIKED: {len(work.pairs[1])} pairs match"]
