@@ -60,6 +60,7 @@ LOSS_PX, MAX_ERROR_PX, MIN_ANGLE_DEG = 0.5, 4.0, 1.5
 """Of the last bundle adjustment: scale of the Cauchy loss and largest error of an observation, in pixels of the image
 where features are detected, and smallest triangulation angle."""
 FEW_PAIRS, STRONGEST = 100, 2048  # if there are more pairs, only so many SIFT features of each photograph are matched
+MIN_POINTS = 30  # points of a photograph in a model; COLMAP requires as many when it estimates a pose
 _BATCH = 64  # pairs that are matched at once
 
 
@@ -269,7 +270,7 @@ class _Work:
             kept = ordered[:1] + [model for model in ordered[1:] if not {*model.reg_image_ids()} <= inside]
             for model in tqdm(kept, "refine", unit="model"):
                 self._refine(model)
-        return kept
+        return [model for model in kept if model.num_reg_images() >= MIN_MODEL]
 
     def _incremental_options(self) -> pycolmap.IncrementalPipelineOptions:
         """Return options that are less precise on the way than COLMAP's, in half of the time, as `_refine` follows."""
@@ -294,13 +295,16 @@ class _Work:
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = LOSS_PX * scale
         options.ceres.solver_options.max_num_iterations = 50
-        config = pycolmap.BundleAdjustmentConfig()
-        for number in model.reg_image_ids():
-            config.add_image(number)
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         for _ in range(2):
+            config = pycolmap.BundleAdjustmentConfig()
+            for number in model.reg_image_ids():
+                config.add_image(number)
+            config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
             pycolmap.create_default_bundle_adjuster(options, config, model).solve()
             pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX * scale, MIN_ANGLE_DEG)
+            for image in list(model.images.values()):  # a wrong pose keeps few points
+                if image.has_pose and image.num_points3D < MIN_POINTS:
+                    model.deregister_frame(image.frame_id)
 
 
 @contextmanager
