@@ -123,6 +123,13 @@ def test_two_places_are_two_models(photographs: Path, tmp_path: Path) -> None:
     assert "in model 1, of 4 photographs" in left["other/002.png"]
 
 
+def test_the_capture_is_in_the_folder_of_the_photographs(tmp_path: Path) -> None:
+    for name in ("a.jpg", "PLACE/reconstruction/sessions/ios_map/raw_data/a.jpg", "PLACE/reconstruction/images/b.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        PIL.Image.new("RGB", (64, 48)).save(tmp_path / name)
+    assert [item.name for item in gather([tmp_path], tmp_path / "PLACE/reconstruction/images")[0]] == ["a.jpg"]
+
+
 def test_nothing_fits(tmp_path: Path) -> None:
     photographs = tmp_path / "photographs"
     photographs.mkdir()
@@ -153,11 +160,11 @@ def test_sources_that_are_none(photographs: Path, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("no image")
     for source in (tmp_path / "missing", tmp_path / "notes.txt"):
         with pytest.raises(CaptureError, match=source.name):
-            gather([source], tmp_path / "made")
+            gather([source], tmp_path / "PLACE/reconstruction/images")
     file = photographs / "000.jpg"
     file = file if file.exists() else next(photographs.glob("000*"))
     with pytest.raises(CaptureError, match="one name"):
-        gather([file, file], tmp_path / "made")
+        gather([file, file], tmp_path / "PLACE/reconstruction/images")
 
 
 def test_other_formats_are_converted_with_their_tags(tmp_path: Path) -> None:
@@ -169,7 +176,7 @@ def test_other_formats_are_converted_with_their_tags(tmp_path: Path) -> None:
     gps.update({1: "S", 2: (12.0, 30.0, 36.0), 3: "E", 4: (7.0, 15.0, 0.0), 5: b"\x01", 6: 30.0})
     PIL.Image.fromarray(pixels).save(tmp_path / "a.tiff", exif=exif)
     PIL.Image.fromarray(pixels).save(tmp_path / "b.webp", lossless=True, exif=exif)
-    found, _ = gather([tmp_path], tmp_path / "made")
+    found, _ = gather([tmp_path], tmp_path / "PLACE/reconstruction/images")
     assert [item.name for item in found] == ["a.tiff.png", "b.webp.png"]
     for item in found:
         turned = item.name.startswith("a")  # Pillow turns a TIFF upright
@@ -194,7 +201,7 @@ def test_cameras_are_shared_by_folder_size_and_tags(tmp_path: Path) -> None:
     write("b/2.jpg", (64, 48))
     for number, width in enumerate((60, 70, 80, 80)):
         write(f"c/{number}.jpg", (width, 48))
-    found, _ = gather([tmp_path], tmp_path / "made")
+    found, _ = gather([tmp_path], tmp_path / "PLACE/reconstruction/images")
     numbers, cameras = initial_cameras(found, None)
     assert numbers == [0, 0, 1, 2, 2, 3, 4, 5, 6]
     assert cameras[0].mean_focal_length() == pytest.approx(28 * 80 / np.hypot(36, 24))
@@ -220,10 +227,10 @@ def test_frames_of_a_video_move_and_are_sharp(tmp_path: Path) -> None:
     assert steps.min() >= 2
     assert steps.max() <= 8
     assert len(list(choose_frames(video, fps=2))) == pytest.approx(12, abs=1)
-    names = [item.name for item in gather([video], tmp_path / "made", 1)[0]]
+    names = [item.name for item in gather([video], tmp_path / "PLACE/reconstruction/images", 1)[0]]
     assert names[0].startswith("walk/frame_")
     for fps in (None, 1):  # the frames of another rate are replaced
-        again = [item.name for item in gather([video], tmp_path / "made", fps)[0]]
+        again = [item.name for item in gather([video], tmp_path / "PLACE/reconstruction/images", fps)[0]]
         assert (again == names) == (fps == 1)
     (tmp_path / "torn.mp4").write_bytes(b"no video")
     with pytest.raises(CaptureError, match=r"torn\.mp4"):

@@ -69,6 +69,8 @@ def _files(sources: Sequence[Path], made: Path, fps: float | None) -> Iterator[t
         prefix = f"{source.stem if source.is_file() else source.name}/" if len(sources) > 1 else ""
         if source.is_dir():
             for name in list_images(source, (*IMAGE_SUFFIXES, *OTHER_SUFFIXES, *VIDEO_SUFFIXES)):
+                if (source / name).absolute().is_relative_to(made.absolute().parents[1]):
+                    continue  # the capture is in the folder of the photographs, from a command that was stopped
                 if name.lower().endswith(VIDEO_SUFFIXES):
                     video = Path(name).with_suffix("").as_posix()
                     yield from _frames(source / name, made, f"{prefix}{video}/", fps)
