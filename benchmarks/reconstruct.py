@@ -14,6 +14,8 @@ import os
 import shutil
 import tempfile
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -89,9 +91,9 @@ def run_colmap(images: Path, work: Path, threads: int) -> dict[str, Floats]:
     return {name: make_pose(pose.rotation.matrix(), pose.translation) for name, pose in poses.items()}
 
 
-METHODS = {
-    "toolkit": lambda *inputs: run_toolkit(*inputs, "incremental"),
-    "global": lambda *inputs: run_toolkit(*inputs, "global"),
+METHODS: dict[str, Callable[[Path, Path, int], dict[str, Floats]]] = {
+    "toolkit": partial(run_toolkit, mapper="incremental"),
+    "global": partial(run_toolkit, mapper="global"),
     "colmap": run_colmap,
 }
 

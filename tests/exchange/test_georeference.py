@@ -38,7 +38,7 @@ def placed(model: pycolmap.Reconstruction, geo: dict[str, tuple[float, float, fl
 def test_a_degree_east_and_north() -> None:
     # Length of a degree at 45 degrees: 111.132 km of latitude, 78.847 km of longitude.
     moved = east_north_up(np.array([[45.0005, 7.0, 0.0], [45.0, 7.001, 0.0], [45.0, 7.0, 9.0]]), np.array([45, 7, 0.0]))
-    np.testing.assert_allclose(moved, [[0, 55.566, 0], [78.847, 0, 0], [0, 0, 9]], atol=0.01)
+    np.testing.assert_allclose(moved, [[0.0, 55.566, 0.0], [78.847, 0.0, 0.0], [0.0, 0.0, 9.0]], atol=0.01)
 
 
 def test_gps_noise_and_outliers() -> None:
