@@ -20,12 +20,15 @@ import pycolmap
 import pytest
 import torch
 from numpy.testing import assert_allclose
+from typer.testing import CliRunner
 
 from tests.calls import call
 from tests.other_kind import add_other_kind
 from tests.rendered import copy_shared
 from toolkit import geometry, localize, sequence
+from toolkit.__main__ import app
 from toolkit.capture import Capture, Session, Trajectory
+from toolkit.capture.cameras import camera_text
 from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.images import read_image
 from toolkit.capture.tables import POSE_NAMES
@@ -665,6 +668,54 @@ def opened(finished: tuple[SceneFiles, pd.DataFrame]) -> Map:
     return Map.open(finished[0].run, finished[0].scene, "ios")
 
 
+def test_a_picture_without_a_camera_gets_the_focal_length_that_fits(opened: Map, small_capture: Path) -> None:
+    session = Capture.open(small_capture)["ios_query"]
+    rows = session.rows_of_keyframes(session.keyframes("pruned"))
+    found = []
+    for row in [int(rows[0]) for rows in rows]:
+        pixels, camera = read_image(session.image_path(row)), session.camera(session.images["sensor_id"].iloc[row])
+        # Cropped about its principal point, as no camera of the map has this size.
+        left, top = 40, 30
+        part = np.ascontiguousarray(pixels[top : camera.height - top, left : camera.width - left])
+        answer = localize_image(opened, part)
+        if answer.status == Status.OK:
+            errors = geometry.pose_error(answer.world_from_rig, session.world_from_cam([row], ground_truth=True)[0])
+            assert errors[0] < 5
+            assert errors[1] < 0.5
+            assert "focal length" in answer.remark
+            found.append(float(answer.remark.split()[2]) / camera.mean_focal_length())
+    assert found
+    assert np.median(found) == pytest.approx(1, abs=0.05)
+
+
+def test_a_picture_without_a_camera_that_tells_nothing(opened: Map) -> None:
+    answer = localize_image(opened, np.full((300, 400), 90, np.uint8))
+    assert answer.status == Status.FAILED
+    assert "480 px, a guess" in answer.remark
+
+
+def test_photographs_on_the_command_line(opened: Map, small_capture: Path, tmp_path: Path) -> None:
+    session = Capture.open(small_capture)["ios_query"]
+    assert opened.files is not None
+    run = tmp_path / "run"
+    shutil.copytree(opened.files.run, run)
+    (run / "run.json").write_text("{}")
+    photo = str(session.image_path(0))
+    camera = camera_text(session.camera(session.images["sensor_id"].iloc[0]))
+    command = ["localize", str(run), photo, str(tmp_path / "nowhere.jpg"), "--camera", camera, "--json"]
+    before = snapshot(run)
+    result = CliRunner().invoke(app, [*command, "--picture", str(tmp_path / "above.png")])
+    assert result.exit_code == 0
+    answer, missing = json.loads(result.stdout)["photographs"]
+    expected = localize_image(opened, photo, session.camera(session.images["sensor_id"].iloc[0]))
+    assert answer["status"] == expected.status_text
+    if expected.world_from_rig is not None:
+        np.testing.assert_array_equal(answer["world_from_cam"], expected.world_from_rig)
+    assert missing["status"].startswith("failed: ImageError")
+    assert (tmp_path / "above.png").stat().st_size > 0
+    assert snapshot(run) == before
+
+
 def snapshot(folder: Path) -> dict[str, tuple[int, int]]:
     return {
         str(path): (path.stat().st_size, path.stat().st_mtime_ns)
@@ -721,12 +772,12 @@ def camera_of(params: list[float], width: int = 10) -> pycolmap.Camera:
         ({"image": [[1, 2], [3]]}, "list"),
         ({"image": ["1.jpg", "2.jpg"]}, "2 images, 1 cameras"),
         ({"camera": "PINHOLE, 10, 20, 10, 10, 5, 10"}, "camera: found 'PINHOLE.*parse_camera"),
-        ({"camera": None}, "camera: found None"),
         ({"camera": camera_of([10, 10, 5])}, "camera: found 3 parameters"),
         ({"camera": camera_of([-10, 10, 5, 10])}, "camera: found a focal length"),
         ({"camera": camera_of([np.nan, 10, 5, 10])}, "camera: .*finite"),
         ({"camera": camera_of([10, 10, 5, 10], width=11)}, "10 x 20 pixels, its camera 11 x 20"),
         ({"rig_from_cams": np.eye(3)}, r"rig_from_cams: found \(3, 3\)"),
+        ({"image": ["a.jpg", "b.jpg"], "camera": None}, "camera: found None"),
         ({"image": [], "camera": []}, "0 images"),
         ({"image": "12345.jpg", "camera": []}, "1 images, 0 cameras"),
         ({"turns": [1, 2]}, "2 turns"),

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import sys
 import traceback
@@ -65,6 +66,9 @@ _FAILED = (
     "recall counts a missing pose as a miss, so a rough pose cannot reduce it, and the submission is complete. The "
     "description gives the number of such queries, and submission.csv lists them. `leave-out`: nothing."
 )
+_SOURCES = "Image files, folders of images (a camera each) and videos; the last one is the folder of the new capture."
+_HELD_OUT = "Every Nth photograph becomes a query with truth, and the map is run and evaluated on them; 0: none."
+_DISTANCE = "Meters between two points, given by a pixel each, or between the cameras of two images."
 _TABLE = "CSV with a header: image; qw,qx,qy,qz,tx,ty,tz for poses; camera_id, or model,width,height,params."
 
 
@@ -110,6 +114,64 @@ def run(
         _print_json(result)
     if result["exit_code"] != 0:
         raise IncompleteError(result["error"])
+
+
+@app.command()
+def localize(
+    run: Run,
+    photographs: Annotated[list[Path], Argument(help="Image files.")],
+    device: Annotated[str, Option(help="Map device.")] = "ios",
+    scene: Annotated[str | None, Option(help="Capture; default: the run's only one.")] = None,
+    camera: Annotated[
+        str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics; default: estimated from the matches.")
+    ] = None,
+    picture: Annotated[Path | None, Option(help="Image file to write: the map and the poses, from above.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Localize photographs in the map of a run, which is not changed."""
+    import numpy as np
+
+    from toolkit.capture import parse_camera
+    from toolkit.errors import CameraError, reason_of
+    from toolkit.geometry import qt_from_pose
+    from toolkit.scene import Run as FinishedRun
+    from toolkit.scene import localize_image
+
+    try:
+        given = None if camera is None else parse_camera("camera", camera)
+    except ValueError as error:
+        raise CameraError(f"camera: {error}") from None
+    place = FinishedRun.open(run).map(device, scene)
+    rows, poses = [], [np.full((4, 4), np.nan)]
+    for path in photographs:
+        row: dict[str, Any] = {"image": str(path), "status": "", "world_from_cam": None}
+        try:
+            result = localize_image(place, path, given)
+            row |= {"status": result.status_text, "inliers": result.num_inliers, "remark": result.remark}
+            if result.world_from_rig is not None:
+                poses.append(result.world_from_rig)
+                row |= {"world_from_cam": result.world_from_rig.tolist(), "position_std_m": result.position_std_m}
+        except ToolkitError as error:
+            row["status"] = f"failed: {reason_of(error, f'localize {path}')}"
+        rows.append(row)
+        if not as_json:
+            print(f"{path}: {row['status']}. {row.get('remark', '')}")
+            if row["world_from_cam"] is not None:
+                qw, qx, qy, qz, *xyz = qt_from_pose(np.array(row["world_from_cam"])).tolist()
+                print(f"  position {xyz[0]:.3f} {xyz[1]:.3f} {xyz[2]:.3f}, qw qx qy qz "
+                      f"{qw:.5f} {qx:.5f} {qy:.5f} {qz:.5f}, {row['inliers']} inliers")  # fmt: skip
+    if picture is not None:
+        from toolkit.figures.top_view import draw_scene
+
+        points, colors = np.zeros((0, 3)), None
+        for mapped in place.mapped[:1]:
+            points, colors = mapped.map.points, mapped.map.colors
+        found, true, title = np.stack(poses), np.full((len(poses), 4, 4), np.nan), "Photographs in the map, from above"
+        unit = ("m" if place.capture.unit else "unknown unit", 1.0)
+        draw_scene(points, colors, place.session.world_from_cam(), found, true, title=title, unit=unit).savefig(picture)
+        print(f"Picture: {picture}", file=sys.stderr if as_json else sys.stdout)
+    if as_json:
+        _print_json({"run": str(run), "photographs": rows})
 
 
 @app.command()
@@ -296,6 +358,51 @@ def import_transforms(
 
     for report in import_transforms(transforms, capture, device, split, placing, axes, unit, hold_out):
         print(report.text())
+
+
+@app.command()
+def reconstruct(
+    sources: Annotated[list[Path], Argument(metavar="PHOTOS... CAPTURE", help=_SOURCES)],
+    device: Device = "ios",
+    hold_out: Annotated[int, Option(metavar="N", help=_HELD_OUT)] = 0,
+    fps: Annotated[float | None, Option(help="Frames per second of a video; default: chosen by motion.")] = None,
+    camera: Annotated[
+        str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all photographs; else estimated.")
+    ] = None,
+    distance: Annotated[
+        tuple[str, str, float] | None, Option(metavar="IMAGE:X,Y IMAGE:X,Y METERS", help=_DISTANCE)
+    ] = None,
+    positions: Annotated[Path | None, Option(help="CSV: image,x,y,z, known camera centers in meters.")] = None,
+    mapper: Annotated[str, Option(metavar="incremental|global", help="COLMAP's mapper.")] = "incremental",
+    placing: Placing = "link",
+) -> None:
+    """Make a map from photographs or videos without poses, by structure from motion."""
+    from toolkit import pipeline
+    from toolkit.capture import Capture
+    from toolkit.exchange.new_manifest import new_manifest
+    from toolkit.exchange.reconstruct import FOLDER, reconstruct
+    from toolkit.figures.explore import draw_top_view
+
+    if len(sources) < 2:
+        raise ManifestError("reconstruct: expected photographs and then the folder of the new capture.")
+    *photos, capture = sources
+    manifest = Path("data_manifests") / f"{re.sub(r'[^A-Za-z0-9._-]', '-', capture.resolve().name)}.yaml"
+    if manifest.exists() and str(capture) not in manifest.read_text(encoding="utf-8"):
+        raise ManifestError(f"{manifest} is about another capture. Rename it, or give {capture} another name.")
+    result = reconstruct(photos, capture, device, hold_out, fps, camera, distance, positions, mapper, placing)
+    print(result.text())
+    picture = capture / FOLDER / "cameras.png"
+    draw_top_view(Capture.open(capture), points=result.points, colors=result.colors).savefig(picture)
+    print(f"Picture: {picture}")
+    if not manifest.exists():
+        new_manifest(manifest.stem, capture)
+    print(f"Manifest: {manifest}")
+    if hold_out:
+        run_dir = pipeline.run(manifest)
+        print(f"Report: {run_dir / 'report.html'}\nLocalize more: python -m toolkit localize {run_dir} PHOTOGRAPH")
+    else:
+        print(f"Import queries: python -m toolkit import images QUERIES {capture} --device {device}{result.camera}")
+        print(f"Then run it: python -m toolkit run {manifest}")
 
 
 @export_app.command("colmap")

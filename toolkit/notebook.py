@@ -229,8 +229,10 @@ def choose_photograph(scene_map: Any) -> None:
         return
     import ipywidgets
 
+    from toolkit.localize import localize_image
+
     chooser = ipywidgets.FileUpload(description="photograph", accept="image/*")
-    focal = ipywidgets.FloatText(description="focal [px]", tooltip="0: from the EXIF tags of the file")
+    focal = ipywidgets.FloatText(description="focal [px]", tooltip="0: from EXIF, or estimated")
     out = ipywidgets.Output()
 
     def localize(_: Any) -> None:
@@ -240,7 +242,7 @@ def choose_photograph(scene_map: Any) -> None:
             file = Path(folder) / Path(chosen["name"]).name
             file.write_bytes(chosen["content"])
             try:
-                result = scene_map.locate(scene_map.query(file, _camera_of(file, focal.value)))
+                result = localize_image(scene_map, file, _camera_of(file, focal.value))
                 display(result, result.show(), result.show_3d())
             except errors.ToolkitError as error:
                 print(error)

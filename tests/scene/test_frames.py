@@ -125,7 +125,6 @@ GRAY = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
     ("picture", "cameras", "rig_from_cams", "message"),
     [
         (GRAY, "phone", None, "camera: found 'phone'"),
-        (GRAY, None, None, "camera: found none"),
         (GRAY[:, 1:], CAMERA, None, "639 x 480 pixels, its camera 640 x 480"),
         ([GRAY, GRAY], (CAMERA,), np.eye(4)[None], "2 images, 1 cameras"),
         ([GRAY], (CAMERA,), np.diag([2.0, 2, 2, 1])[None], "rig_from_cams: found no pose"),

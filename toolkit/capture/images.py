@@ -46,6 +46,8 @@ _FOCAL_MM, _FOCAL_35MM, _WIDTH = 0x920A, 0xA405, 0xA002
 _PLANE_X, _PLANE_UNIT = 0xA20E, 0xA210
 _UNIT_MM = {0.0: 25.4, 2.0: 25.4, 3.0: 10.0, 4.0: 1.0}  # 0, a missing tag, means inches
 NO_FILE = "no such file"
+EXIF_CAMERA = (0x010F, 0x0110, _FOCAL_MM, _FOCAL_35MM)
+"""EXIF tags that distinguish cameras: make, model and focal lengths."""
 _FILM_DIAGONAL_MM = float(np.hypot(36, 24))
 
 

@@ -93,6 +93,7 @@ class Draft:
     rigs: list[tuple[str, str, Floats]] = field(default_factory=list)  # rig, sensor, rig_from_sensor (4, 4)
     unit: str | None = "m"  # unit of the poses; None: unknown
     notes: list[str] = field(default_factory=list)
+    sources: dict[str, Path] = field(default_factory=dict)  # files that are not in `folder` under their names
     sensors: dict[str, str] = field(default_factory=dict)  # id by `camera_text`, for images that are not in a rig
 
     def add(self, name: str, camera: pycolmap.Camera, world_from_cam: Floats | None) -> None:
@@ -101,6 +102,10 @@ class Draft:
         self.images.append(DraftImage(name, camera, sensor, name))
         if world_from_cam is not None:
             self.poses[name] = world_from_cam
+
+    def source(self, name: str) -> Path:
+        """Return the file of an image."""
+        return self.sources.get(name, self.folder / name)
 
     def leave_out(self) -> None:
         """Leave out the images that cannot be used; raise CaptureError if none is left."""
@@ -125,7 +130,7 @@ class Draft:
         table = pd.DataFrame(self.rows, columns=columns).astype({"timestamp": "Int64"})
         with write_folder(self.session) as session:
             for image in self.images:
-                source, target = self.folder / image.name, session / RAW_DATA / image.path
+                source, target = self.source(image.name), session / RAW_DATA / image.path
                 target.parent.mkdir(parents=True, exist_ok=True)
                 if self.placing == "copy":
                     shutil.copyfile(source, target)
@@ -170,7 +175,7 @@ class Draft:
         if is_bad_name(image.name):
             return f"the capture format cannot hold this name, expected {EXPECTED_NAME}"
         try:
-            size, exif = read_header(self.folder / name)
+            size, exif = read_header(self.source(image.name))
         except ImageError as error:
             return str(error)
         orientation, camera = read_number(exif, ORIENTATION), image.camera
@@ -223,7 +228,7 @@ def write_drafts(*drafts: Draft) -> list[ImportReport]:
     return [draft.write() for draft in drafts]
 
 
-def list_images(folder: Path) -> list[str]:
+def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[str]:
     """Return the images in and below a folder, sorted by path. Links to folders elsewhere are followed, each once.
 
     Raises:
@@ -238,9 +243,9 @@ def list_images(folder: Path) -> list[str]:
             else:
                 visited.append(target)
         names += [Path(root, name).relative_to(folder).as_posix() for name in files]
-    names = sorted((name for name in names if name.lower().endswith(IMAGE_SUFFIXES)), key=Path)
+    names = sorted((name for name in names if name.lower().endswith(suffixes)), key=Path)
     if not names:
-        raise CaptureError(f"{folder}: no image in or below it. Expected {', '.join(IMAGE_SUFFIXES)}.")
+        raise CaptureError(f"{folder}: no image in or below it. Expected {', '.join(suffixes)}.")
     return names
 
 

@@ -23,7 +23,7 @@ from toolkit.errors import ArtifactError, ImageError
 from toolkit.features.features import KINDS, Extractor, LocalFeatures, extract_turned
 from toolkit.features.matching import Matcher, PairMatches
 from toolkit.features.sift import SiftExtractor
-from toolkit.files import files_fingerprint, fingerprint
+from toolkit.files import files_fingerprint, fingerprint, link_folder
 from toolkit.geometry import Ints
 from toolkit.store.items import Items
 from toolkit.threads import one_thread
@@ -153,6 +153,8 @@ def extract_session(
         turns = np.zeros(len(session.images), np.int64)
     made_from = {name: _made_from(session, row, int(turns[row])) for name, row in row_of.items()}
     path, label = features_path(out, session.id, extractor.settings), f"{extractor.settings['name']} {session.id}"
+    if not path.exists() and (made := session.path / "proc" / "features" / path.name).is_dir():
+        link_folder(made, path)  # a reconstruction extracted them
     with Items(path, extractor.settings, again=not skip_existing) as items:
         todo = items.left((name, source, row_of[name], int(turns[row_of[name]])) for name, source in made_from.items())
         if todo and any(path.parent.glob(f"{path.name.partition('-')[0]}-*.h5")):

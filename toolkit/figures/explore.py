@@ -98,13 +98,17 @@ def draw_samples(capture: Capture, count: int = 4) -> "Figure":
 
 
 @styled
-def draw_top_view(capture: Capture, up: ArrayLike | None = None, unit: str | None = "auto") -> "Figure":
+def draw_top_view(
+    capture: Capture, up: ArrayLike | None = None, unit: str | None = "auto", points: Floats | None = None,
+    colors: NDArray[np.uint8] | None = None,
+) -> "Figure":  # fmt: skip
     """Draw all camera centers from above, those of queries only with ground truth; return the figure.
 
     Args:
         capture: the capture; places far apart get panels of their own.
         up: up direction (3,); None: estimated from the cameras.
         unit: unit of the poses, None if unknown; `auto`: that of the capture.
+        points, colors: points of the scene (P, 3) and their RGB (P, 3), to draw, too.
     """
     layers = []
     for session in _usable(capture):
@@ -115,7 +119,10 @@ def draw_top_view(capture: Capture, up: ArrayLike | None = None, unit: str | Non
         return _empty("no session with poses can be used")
     everything = np.concatenate([layer.at for layer in layers])
     ground = Ground.below(everything, up, (capture.unit if unit == "auto" else unit, 1.0))
-    figure, _, panels = draw_places(ground, layers, everything)
+    points = np.zeros((0, 3)) if points is None else points
+    tint = "#9A9A9A" if colors is None else np.clip(colors / 255 * 0.75 + 0.2, 0, 0.75)
+    layers.insert(0, Layer(points, None, tint, s=1.2, lw=0, rasterized=True))
+    figure, _, panels = draw_places(ground, layers, everything, points)
     shared_legend(figure, [axis for axis, _, _ in panels], ncols=6, frameon=False, fontsize=8)
     figure.suptitle("Cameras from above: maps (dots), queries where their pose is known (crosses)")
     return figure

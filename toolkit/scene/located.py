@@ -1,6 +1,5 @@
 """A query in its map: what references, matches and results need to show themselves, and to be tried with changes."""
 
-import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,6 +16,7 @@ from toolkit.pose.base import Query, QueryMatches, References, RoughPose
 from toolkit.pose.pnp import PnpMatches
 from toolkit.pose.result import QueryResult
 from toolkit.results.localized import ShownImage
+from toolkit.scene.query import with_focal
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -120,8 +120,8 @@ class Located:
         other = scene_map.changed(sections.get("localize", {}))
         cameras = [camera or view.camera for view in query.views]
         if camera is not None or focal_px is not None:
-            views = [replace(view, camera=_with_focal(one, focal_px))
-                     for view, one in zip(query.views, cameras, strict=True)]  # fmt: skip
+            cameras = cameras if focal_px is None else [with_focal(one, focal_px) for one in cameras]
+            views = [replace(view, camera=one) for view, one in zip(query.views, cameras, strict=True)]
             query = replace(query, views=views)
         if k is not None:
             found = scene_map.retrieve(query, k)
@@ -165,16 +165,6 @@ def _in(other: Map, scene_map: Map, references: References) -> References:
     names = [scene_map.localizer.image_names[index] for index in references.images]
     indices = np.array([other.index_of.get(name, -1) for name in names], np.int64)
     return References(indices, references.scores).take(indices >= 0)
-
-
-def _with_focal(camera: pycolmap.Camera, focal_px: float | None) -> pycolmap.Camera:
-    """Return a camera with another focal length; the ratio of fx and fy stays."""
-    changed = copy.deepcopy(camera)
-    if focal_px is not None:
-        scaled, at = np.array(changed.params), list(changed.focal_length_idxs())
-        scaled[at] *= focal_px / changed.mean_focal_length()
-        changed.params = scaled.tolist()
-    return changed
 
 
 def show_matches(scene_map: Map, matches: QueryMatches, rank: int, image: int) -> "Figure":

@@ -18,7 +18,7 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, masks
 from toolkit.capture.images import thumbnails
 from toolkit.capture.upright import Turns, upright_turns
-from toolkit.errors import ArtifactError, ManifestError
+from toolkit.errors import ArtifactError, CameraError, ManifestError
 from toolkit.features.features import KINDS
 from toolkit.features.matching import (
     AnyMethod,
@@ -51,7 +51,7 @@ from toolkit.pose.base import (
 from toolkit.pose.local_triangulation import OnDemandLocalizer, PosedImages
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer
-from toolkit.pose.result import QueryResult, Status
+from toolkit.pose.result import CAMERA, QueryResult, Status
 from toolkit.prediction.feed_forward import FeedForwardLocalizer
 from toolkit.prediction.hybrid import HybridLocalizer
 from toolkit.prediction.interface import Predictor
@@ -68,7 +68,7 @@ from toolkit.results.opening import (
 )  # fmt: skip
 from toolkit.results.pair import find_query
 from toolkit.scene.located import Located, Retrieved, ranks, show_matches
-from toolkit.scene.query import Image, query_from
+from toolkit.scene.query import Image, guessed_camera, query_from, with_focal
 from toolkit.scene.search import ReferenceSearch
 from toolkit.threads import fixed_sums
 
@@ -82,6 +82,9 @@ log = logging.getLogger(__name__)
 
 WITHOUT_FEATURES = ("feed_forward", "nearest")
 """Methods that need no local features of the queries."""
+MAP_CAMERAS = 1000  # cameras of the map among which that of an image of equal size is looked for, at most
+FOCAL_STEPS, FOCAL_DOUBT = 3, 1.3
+"""Steps of the estimate of an unknown focal length, and the factor of one that the matches must contradict."""
 FIXED_BY_MAP = ("unit", "world_up")
 """Settings that the length of the map and the turns of its images depend on, so they cannot change for a query."""
 ODD_DEPTHS_M = (0.1, 200.0)
@@ -697,6 +700,10 @@ def localize_image(
 ) -> QueryResult:
     """Localize one image, or those of a rig, as the run of the map would: `Map.query` and `Map.locate` in one call.
 
+    Without a camera, the focal length of one image is estimated from its matches. It starts at that of EXIF, at that of
+    the map's camera with equal image size, or at 1.2 times the longer side; `remark` says which one was used. If the
+    matches do not tell it, for example on a plane, the pose is `low_confidence: camera?`.
+
     Args:
         scene_map: an open map, see `Map.open`; it is not changed.
         image, camera, rig_from_cams, turns: see `scene.query.query_from`.
@@ -707,7 +714,38 @@ def localize_image(
     """
     if not isinstance(scene_map, Map):
         raise ArtifactError(f"Found {type(scene_map).__name__} for a map, expected what `Map.open` returns.")
+    if camera is None:
+        if rig_from_cams is not None or isinstance(image, list | tuple):
+            raise CameraError("camera: found None for several images, expected a camera for each.")
+        return _with_unknown_focal(scene_map, image, turns, near)
     return scene_map.locate(scene_map.query(image, camera, rig_from_cams, turns), near)
+
+
+def _with_unknown_focal(
+    scene_map: Map, image: Image, turns: Sequence[int] | None, near: RoughPose | None
+) -> QueryResult:
+    """Localize an image without a camera, again with the focal length that fits its matches, until none fits better."""
+    sensors = scene_map.session.sensors
+    ids = sensors.loc[sensors["sensor_type"] == "camera", "sensor_id"].head(MAP_CAMERAS)
+    camera, origin = guessed_camera(image, [scene_map.session.camera(str(name)) for name in ids])
+
+    def locate(focal_px: float) -> QueryResult:
+        return scene_map.locate(scene_map.query(image, with_focal(camera, focal_px), None, turns), near)
+
+    focal_px = camera.mean_focal_length()
+    result = locate(focal_px)
+    told = False
+    for _ in range(FOCAL_STEPS):
+        fitting = result.focals_px[0] if result.focals_px else np.nan
+        if not np.isfinite(fitting):
+            break
+        focal_px, told = float(fitting), True
+        result = locate(focal_px)
+    text = f"focal length {focal_px:.0f} px, {'which fits its matches' if told else origin}"
+    if result.status == Status.OK and not told and not locate(FOCAL_DOUBT * focal_px).misfit:
+        result = replace(result, status=Status.LOW_CONFIDENCE, reason=CAMERA)
+        text += ", and the matches do not tell it"
+    return replace(result, remark="; ".join(filter(None, [text, result.remark])))
 
 
 def needs_upright(settings: LocalizeSettings, kinds: Sequence[AnyMethod]) -> bool:

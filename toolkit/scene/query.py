@@ -10,19 +10,20 @@ import pycolmap
 from numpy.typing import NDArray
 
 from toolkit.capture.cameras import camera_text, parse_camera
-from toolkit.capture.images import exif_camera
+from toolkit.capture.images import exif_camera, stored_size
 from toolkit.errors import CameraError, ImageError
 from toolkit.pose.base import Query, View
 
 _MAX_DEVIATION = 1e-3
 """Largest deviation of R @ R.T from the identity for a rotation R; rounding to float32 or in files stays below."""
+FOCAL_PRIOR = 1.2  # focal length of a camera that nothing is known of, in multiples of the longer side
 Image = Any
 """A file (str, Path), or pixels as `pixels_from` takes them."""
 
 
 def query_from(
     image: Image | Sequence[Image],
-    camera: pycolmap.Camera | Sequence[pycolmap.Camera] | None = None,
+    camera: pycolmap.Camera | Sequence[pycolmap.Camera],
     rig_from_cams: NDArray[np.float64] | None = None,
     turns: Sequence[int] | None = None,
 ) -> Query:
@@ -30,22 +31,16 @@ def query_from(
 
     Args:
         image: a file, or pixels as `pixels_from` takes them; for a rig, a sequence of C images.
-        camera: intrinsics, with the size of the image; for a rig, a sequence of C cameras. None: a guess from the
-            EXIF tags of the file, see `capture.images.exif_camera`.
+        camera: intrinsics, with the size of the image; for a rig, a sequence of C cameras.
         rig_from_cams: (C, 4, 4), for a rig.
         turns: for each image, the counter-clockwise quarter turns that bring gravity down; None: all are upright.
             Only learned embedders and networks use them.
 
     Raises:
-        ImageError: an image is neither a file nor pixels, or has no camera and no focal length in EXIF.
+        ImageError: an image is neither a file nor pixels.
         CameraError: an invalid camera, pose or turn. It is an ImageError.
     """
     images = list(image) if _are_several(image) else [image]
-    if camera is None:
-        files = [Path(one) for one in images if isinstance(one, str | Path)]
-        if len(files) < len(images):
-            raise CameraError("camera: found none for pixels. Only a file may do without, with a focal length in EXIF.")
-        camera = [exif_camera(file)[0] for file in files]
     cameras: list[Any] = list(camera) if isinstance(camera, list | tuple) else [camera]
     for intrinsics in cameras:
         _check_camera(intrinsics)
@@ -98,6 +93,35 @@ def pixels_from(image: Any) -> NDArray[np.uint8]:
         raise ImageError(f"Found {found} from {low:g} to {high:g}; expected 0 to 1, or 0 to 255.")
     scale = 255 if pixels.dtype.kind == "f" and high <= 1 else 1
     return np.round(pixels * scale).astype(np.uint8)
+
+
+def guessed_camera(image: Image, known: Sequence[pycolmap.Camera]) -> tuple[pycolmap.Camera, str]:
+    """Return a camera of an image, and where its focal length is from: EXIF, the only known one of its size, or none.
+
+    Raises:
+        ImageError: the image cannot be read.
+    """
+    is_file = isinstance(image, str | Path)
+    if is_file:
+        try:
+            return exif_camera(Path(image))
+        except ImageError:  # no focal length, or no image, which the next line says
+            width, height = stored_size(image)
+    else:
+        height, width = pixels_from(image).shape[:2]
+    alike = {camera_text(camera): camera for camera in known if (camera.width, camera.height) == (width, height)}
+    if len(alike) == 1:
+        return next(iter(alike.values())), "that of the map's camera"
+    params = [FOCAL_PRIOR * max(width, height), width / 2, height / 2]
+    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
+    return camera, f"a guess, {FOCAL_PRIOR:g} times the longer side"
+
+
+def with_focal(camera: pycolmap.Camera, focal_px: float) -> pycolmap.Camera:
+    """Return a camera with another focal length, in x, pixels."""
+    params = np.array(camera.params)
+    params[list(camera.focal_length_idxs())] *= focal_px / camera.mean_focal_length()
+    return pycolmap.Camera(model=camera.model.name, width=camera.width, height=camera.height, params=params.tolist())
 
 
 def _are_several(image: Any) -> bool:

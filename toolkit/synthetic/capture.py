@@ -263,8 +263,9 @@ def _add_hard(sessions: Path, world: World, table: Tables, elsewhere: Scene) -> 
             if worsen is not None:
                 picture = worsen(picture, named_rng(world.seed, "hard", name))
             if name == "two-places":
-                half = picture.shape[1] // 2
-                picture[:, half:] = cv2.imread(str(raw / easy[-1][2]))[:, half:]
+                half, other = picture.shape[1] // 2, cv2.imread(str(raw / easy[-1][2]))
+                assert other is not None
+                picture[:, half:] = other[:, half:]
             _save(raw / path, picture, [cv2.IMWRITE_JPEG_QUALITY, device.quality])
             if name == "torn":
                 whole = (raw / path).read_bytes()

@@ -1,0 +1,242 @@
+"""Photographs to a map: what is registered, held out, left out, found again; cameras and frames of videos."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import PIL.Image
+import pycolmap
+import pytest
+from typer.testing import CliRunner
+
+from toolkit.__main__ import app
+from toolkit.capture import Capture
+from toolkit.errors import CaptureError, ManifestError
+from toolkit.exchange import reconstruct as module
+from toolkit.exchange.photographs import choose_frames, gather, initial_cameras
+from toolkit.exchange.reconstruct import reconstruct
+from toolkit.features.sift import SiftExtractor
+from toolkit.features.stores import extract_session, features_path
+from toolkit.files import read_json
+from toolkit.geometry import Floats
+
+
+@pytest.fixture(scope="session")
+def photographs(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The 6 photographs of the phone's map, one that is blank and one file that is no image."""
+    folder = tmp_path_factory.mktemp("photographs")
+    session = Capture.open(small_capture)["ios_map"]
+    for row in range(len(session.images)):
+        shutil.copy(session.image_path(row), folder / f"{row:03d}{session.image_path(row).suffix}")
+    camera = session.camera(session.images["sensor_id"].iloc[0])
+    PIL.Image.new("RGB", (camera.width, camera.height), (90, 90, 90)).save(folder / "blank.png")
+    (folder / "torn.jpg").write_bytes(b"not an image")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def place(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("place") / "PLACE"
+    reconstruct([photographs], place, hold_out=4)
+    return place
+
+
+def relative_rotations_deg(ours: Floats, true: Floats) -> Floats:
+    """Angles between the relative rotations of neighbors."""
+    apart = [poses[:-1, :3, :3].transpose(0, 2, 1) @ poses[1:, :3, :3] for poses in (ours, true)]
+    trace = np.einsum("nij,nij->n", *apart)
+    return np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+
+
+def test_poses_are_those_of_the_truth(place: Path, small_capture: Path) -> None:
+    capture, true = Capture.open(place), Capture.open(small_capture)["ios_map"].world_from_cam()
+    poses = {}
+    for session in (capture["ios_map"], capture["ios_query"]):
+        assert session.ground_truth is not None
+        for row, pose in enumerate(session.world_from_cam(ground_truth=True)):
+            poses[session.image_path(row).stem] = pose
+    assert sorted(poses) == [f"{number:03d}" for number in range(6)]
+    ours = np.stack([poses[name] for name in sorted(poses)])
+    assert relative_rotations_deg(ours, true).max() < 1.0
+    a, b = (poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0) for poses in (ours, true))
+    found = pycolmap.estimate_sim3d(a, b)
+    assert found is not None
+    spread = np.linalg.norm(b, axis=1).mean()
+    assert np.linalg.norm(found * a - b, axis=1).max() < 0.1 * spread
+    assert capture.unit is None
+
+
+def test_every_photograph_has_a_row(place: Path) -> None:
+    import pandas as pd
+
+    rows = pd.concat(
+        [pd.read_csv(place / "sessions" / name / "proc/import.csv") for name in ("ios_map", "ios_query")]
+    ).set_index("image")["status"]
+    assert len(rows) == 8
+    assert (rows == "imported").sum() == 6
+    assert "no matches" in rows["blank.png"]
+    assert "image" in rows["torn.jpg"]
+    record = read_json(place / "sessions/ios_map" / module.RECORD)
+    assert (record["photographs"], record["registered"]) == (8, 6)
+
+
+def test_a_run_takes_the_features(place: Path, tmp_path: Path) -> None:
+    for name in ("ios_map", "ios_query"):
+        session = Capture.open(place)[name]
+        made = next((session.path / "proc/features").glob("sift-*/*.shard"))
+        store = extract_session(session, tmp_path)
+        path = features_path(tmp_path, name, SiftExtractor().settings)
+        assert [shard.name for shard in path.glob("*.shard")] == [made.name]
+        assert set(session.image_names) <= set(store)
+
+
+def test_a_second_one_computes_only_the_model(
+    photographs: Path, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    again = tmp_path / "PLACE"
+    shutil.copytree(place / module.FOLDER, again / module.FOLDER, symlinks=True)
+
+    def refuse(*_: Any) -> None:
+        raise AssertionError("extracted or matched again")
+
+    monkeypatch.setattr(SiftExtractor, "extract", refuse)
+    monkeypatch.setattr(module._Mutual, "match_unit", refuse)
+    reconstruct([photographs], again)
+    assert len(Capture.open(again)["ios_map"].images) == 6
+
+
+def test_two_places_are_two_models(photographs: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    for path in sorted(photographs.glob("0*")):
+        with PIL.Image.open(path) as image:
+            mirrored = np.asarray(image.convert("RGB"))[:, ::-1]
+        PIL.Image.fromarray(255 - mirrored).save(other / f"{path.stem}.png")
+    (other / "000.png").unlink()
+    (other / "001.png").unlink()
+    result = reconstruct([photographs, other], tmp_path / "PLACE")
+    assert result.record["registered"] == 6
+    assert result.record["other models"] == [4]
+    left = result.reports[0].images.set_index("image")["status"]
+    assert "in model 1, of 4 photographs" in left["other/002.png"]
+
+
+def test_the_capture_is_in_the_folder_of_the_photographs(tmp_path: Path) -> None:
+    for name in ("a.jpg", "PLACE/reconstruction/sessions/ios_map/raw_data/a.jpg", "PLACE/reconstruction/images/b.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        PIL.Image.new("RGB", (64, 48)).save(tmp_path / name)
+    assert [item.name for item in gather([tmp_path], tmp_path / "PLACE/reconstruction/images")[0]] == ["a.jpg"]
+
+
+def test_nothing_fits(tmp_path: Path) -> None:
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    rng = np.random.default_rng(0)
+    for number in range(3):
+        PIL.Image.fromarray(rng.integers(0, 255, (240, 320, 3), np.uint8)).save(photographs / f"{number}.png")
+    with pytest.raises(CaptureError, match="fit together"):
+        reconstruct([photographs], tmp_path / "PLACE")
+    assert not (tmp_path / "PLACE/sessions").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ({"hold_out": 1}, ManifestError),
+        ({"hold_out": 9}, ManifestError),
+        ({"mapper": "magic"}, ManifestError),
+        ({"camera": "PINHOLE, 10"}, ManifestError),
+        ({"positions": "missing.csv"}, CaptureError),
+    ],
+)
+def test_malformed_arguments(photographs: Path, tmp_path: Path, options: dict[str, Any], error: type) -> None:
+    with pytest.raises(error):
+        reconstruct([photographs], tmp_path / "PLACE", **options)
+
+
+def test_sources_that_are_none(photographs: Path, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("no image")
+    for source in (tmp_path / "missing", tmp_path / "notes.txt"):
+        with pytest.raises(CaptureError, match=source.name):
+            gather([source], tmp_path / "PLACE/reconstruction/images")
+    file = photographs / "000.jpg"
+    file = file if file.exists() else next(photographs.glob("000*"))
+    with pytest.raises(CaptureError, match="one name"):
+        gather([file, file], tmp_path / "PLACE/reconstruction/images")
+
+
+def test_other_formats_are_converted_with_their_tags(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    exif = PIL.Image.Exif()
+    exif[0x0110] = "Camera 5"
+    exif[0x0112] = 6
+    gps = exif.get_ifd(0x8825)
+    gps.update({1: "S", 2: (12.0, 30.0, 36.0), 3: "E", 4: (7.0, 15.0, 0.0), 5: b"\x01", 6: 30.0})
+    PIL.Image.fromarray(pixels).save(tmp_path / "a.tiff", exif=exif)
+    PIL.Image.fromarray(pixels).save(tmp_path / "b.webp", lossless=True, exif=exif)
+    found, _ = gather([tmp_path], tmp_path / "PLACE/reconstruction/images")
+    assert [item.name for item in found] == ["a.tiff.png", "b.webp.png"]
+    for item in found:
+        turned = item.name.startswith("a")  # Pillow turns a TIFF upright
+        np.testing.assert_array_equal(np.asarray(PIL.Image.open(item.path)), np.rot90(pixels, -1) if turned else pixels)
+        assert item.exif[0x0110] == "Camera 5"
+        assert item.quarter_turns == (0 if turned else 3)
+    assert found[1].geo == pytest.approx((-12.51, 7.25, -30.0))  # Pillow does not write GPS into a TIFF
+
+
+def test_cameras_are_shared_by_folder_size_and_tags(tmp_path: Path) -> None:
+    def write(name: str, size: tuple[int, int], film_mm: int | None = None) -> None:
+        exif = PIL.Image.Exif()
+        if film_mm:
+            exif.get_ifd(0x8769)[0xA405] = film_mm
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        PIL.Image.new("RGB", size).save(tmp_path / name, exif=exif)
+
+    write("a/1.jpg", (64, 48), 28)
+    write("a/2.jpg", (64, 48), 28)
+    write("a/3.jpg", (64, 48), 50)
+    write("b/1.jpg", (64, 48))
+    write("b/2.jpg", (64, 48))
+    for number, width in enumerate((60, 70, 80, 80)):
+        write(f"c/{number}.jpg", (width, 48))
+    found, _ = gather([tmp_path], tmp_path / "PLACE/reconstruction/images")
+    numbers, cameras = initial_cameras(found, None)
+    assert numbers == [0, 0, 1, 2, 2, 3, 4, 5, 6]
+    assert cameras[0].mean_focal_length() == pytest.approx(28 * 80 / np.hypot(36, 24))
+    assert cameras[0].has_prior_focal_length
+    assert not cameras[2].has_prior_focal_length
+    assert cameras[2].mean_focal_length() == pytest.approx(1.2 * 64)
+
+
+def test_frames_of_a_video_move_and_are_sharp(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    wall = cv2.resize(rng.integers(0, 255, (60, 200, 3), np.uint8), (1600, 480), interpolation=cv2.INTER_CUBIC)
+    video = tmp_path / "walk.mp4"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"mp4v"), 10, (640, 480))
+    for number in range(60):  # 10 frames of rest, then 8 pixels a frame; every other frame is blurred
+        x = 8 * max(0, number - 10)
+        frame = wall[:, x : x + 640]
+        writer.write(cv2.GaussianBlur(frame, (0, 0), 4) if number % 2 else frame)
+    writer.release()
+    chosen = [number for number, _ in choose_frames(video)]
+    assert all(number % 2 == 0 for number in chosen[1:])
+    assert sum(number <= 10 for number in chosen) <= 2
+    steps = np.diff([number for number in chosen if number > 10])
+    assert steps.min() >= 2
+    assert steps.max() <= 8
+    assert len(list(choose_frames(video, fps=2))) == pytest.approx(12, abs=1)
+    names = [item.name for item in gather([video], tmp_path / "PLACE/reconstruction/images", 1)[0]]
+    assert names[0].startswith("walk/frame_")
+    for fps in (None, 1):  # the frames of another rate are replaced
+        again = [item.name for item in gather([video], tmp_path / "PLACE/reconstruction/images", fps)[0]]
+        assert (again == names) == (fps == 1)
+    (tmp_path / "torn.mp4").write_bytes(b"no video")
+    with pytest.raises(CaptureError, match=r"torn\.mp4"):
+        list(choose_frames(tmp_path / "torn.mp4"))
+
+
+def test_the_command_line_explains_what_is_missing(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["reconstruct", str(tmp_path)])
+    assert isinstance(result.exception, ManifestError)

@@ -1,0 +1,226 @@
+"""Make a reconstruction level and metric: from GPS, from known positions, or from one measured distance."""
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from toolkit.capture.world_up import up_of_cameras
+from toolkit.errors import CaptureError, ManifestError
+from toolkit.files import own_name
+from toolkit.geometry import Floats, make_pose
+
+MAX_ERRORS_M = (0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+"""Limits of the error of a known position; the smallest that `MOST` of the positions meet is used."""
+MOST = 0.6
+OUTLIER = 2.5  # smallest error of an outlier, in multiples of the median; for Gaussian noise, 3.8 standard deviations
+MAX_SCALE_DEVIATION = 0.1  # largest relative standard deviation of a scale that is used
+MAX_TILT_DEG = 2.0  # largest standard deviation of the vertical by known positions; else the cameras tell it
+NEAR_PX = 0.02  # largest distance of a point's observations from the given pixel, in multiples of the image's width
+MAX_DEPTHS = 1.15  # largest ratio of the depths of the points there
+_EARTH_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84
+GPS = "GPS in EXIF"
+
+
+@dataclass
+class Placing:
+    """How the world of a model was chosen."""
+
+    unit: str | None  # "m", or None if it is unknown
+    record: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+def place(
+    model: pycolmap.Reconstruction, quarter_turns: Mapping[str, int], geo: Mapping[str, tuple[float, float, float]],
+    distance: tuple[str, str, float] | None = None, positions: Mapping[str, Floats] | None = None,
+) -> Placing:  # fmt: skip
+    """Transform a model in place: z up, and meters if they are known.
+
+    Args:
+        quarter_turns: by the user's name of an image: counter-clockwise turns that make it upright, from EXIF.
+        geo: latitude and longitude, degrees, and altitude, meters.
+        distance, positions: see `reconstruct.reconstruct`.
+
+    Raises:
+        ManifestError: a distance between points that are not known or not clear.
+    """
+    images = {own_name(image.name): image for image in model.images.values() if image.has_pose}
+    up = up_of_cameras([_upright(image, quarter_turns.get(name, 0)) for name, image in images.items()])
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(_rotation_to_z(up)), np.zeros(3)))
+    record: dict[str, Any] = {"up": "by the cameras"}
+    if distance is not None:
+        ends = [_point(model, images, text) for text in distance[:2]]
+        length = float(np.linalg.norm(ends[0] - ends[1]))
+        if not length > 0 or not 0 < distance[2] < np.inf:
+            raise ManifestError(f"distance: found {length:g} in the model and {distance[2]:g} m, expected two lengths.")
+        model.transform(pycolmap.Sim3d(distance[2] / length, pycolmap.Rotation3d(), np.zeros(3)))
+        how = f"a distance of {distance[2]:g} m"
+        return Placing("m", record | {"meters": how}, [f"meters: from {how}; up: by the cameras"])
+    how = "known positions" if positions is not None else GPS
+    origin = None
+    if positions is None:
+        known = [geo[name] for name in images if name in geo]
+        origin = np.median(known, axis=0) if known else np.zeros(3)
+        positions = {name: east_north_up(np.array(geo[name]), origin) for name in images if name in geo}
+    unknown = "the unit of the model is not known: give --distance, --positions, or photographs with GPS. Lengths are "
+    unknown += "relative to the depth of the scene"
+    common = [name for name in images if name in positions]
+    if len(common) < 3:
+        return Placing(None, record, [*([f"{how}: {len(common)} photographs, expected 3"] if common else []), unknown])
+    source = np.array([images[name].projection_center() for name in common])
+    target = np.array([positions[name] for name in common])
+    fitted = fit(source, target)
+    if fitted is None:
+        return Placing(None, record, [f"{how}: does not fit the model", unknown])
+    new_from_old, inliers, residual_m, scale_deviation, level = fitted
+    facts = f"{np.count_nonzero(inliers)} of {len(common)} photographs, residual {residual_m:.2g} m in the median, "
+    facts += f"scale known to {100 * scale_deviation:.1g} %"
+    if scale_deviation > MAX_SCALE_DEVIATION:
+        return Placing(
+            None, record, [f"{how}: of no use for the scale, as the cameras are too close ({facts})", unknown]
+        )
+    model.transform(new_from_old)
+    by = how if level else "the cameras"
+    record |= {"meters": how, "residual_m": residual_m, "scale deviation": scale_deviation, "up": f"by {by}"}
+    if origin is not None:
+        record["origin"] = dict(zip(("latitude_deg", "longitude_deg", "altitude_m"), origin.tolist(), strict=True))
+        record["axes"] = "x east, y north, z up"
+    return Placing("m", record, [f"meters: from {how}, {facts}; up: by {by}"])
+
+
+def fit(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, Floats, float, float, bool] | None:
+    """Fit a similarity to positions (N, 3) with outliers; z is up in both, and stays so if they do not tell it better.
+
+    Returns:
+        target_from_source, inliers (N,), the median of their errors, the relative standard deviation of the scale, and
+        whether the positions told what is up; None if nothing fits.
+    """
+    for max_error in MAX_ERRORS_M:
+        options = pycolmap.RANSACOptions(max_error=max_error, random_seed=0)
+        found: Any = pycolmap.estimate_sim3d_robust(source, target, options)
+        if found is not None and found["num_inliers"] >= max(3, MOST * len(source)):
+            break
+    else:
+        return None
+    new_from_old = found["tgt_from_src"]
+    for _ in range(3):
+        errors = np.linalg.norm(new_from_old * source - target, axis=1)
+        inliers = errors <= max(OUTLIER * np.median(errors), 1e-9)
+        a, b = source[inliers], target[inliers]
+        new_from_old = pycolmap.estimate_sim3d(a, b) or new_from_old
+    errors = np.linalg.norm(new_from_old * a - b, axis=1)
+    spread = np.linalg.svd(b - b.mean(axis=0), compute_uv=False)
+    sigma = np.sqrt((errors**2).sum() / max(3 * len(a) - 7, 1))
+    level = bool(np.degrees(sigma / max(spread[1], 1e-9)) < MAX_TILT_DEG)
+    if not level:  # rotate about z only
+        from_plane, to_plane = ((points - points.mean(axis=0))[:, :2] @ [1, 1j] for points in (a, b))
+        turn = np.vdot(from_plane, to_plane) / np.vdot(from_plane, from_plane).real
+        cos, sin = turn.real / abs(turn), turn.imag / abs(turn)
+        rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
+        shift = b.mean(axis=0) - abs(turn) * rotation @ a.mean(axis=0)
+        new_from_old = pycolmap.Sim3d(abs(turn), pycolmap.Rotation3d(rotation), shift)
+        errors = np.linalg.norm(new_from_old * a - b, axis=1)
+        sigma = np.sqrt((errors**2).sum() / max(3 * len(a) - 5, 1))
+    return new_from_old, inliers, float(np.median(errors)), float(sigma / max(np.linalg.norm(spread), 1e-9)), level
+
+
+def read_positions(path: Path) -> dict[str, Floats]:
+    """Read a CSV file with the columns image, x, y, z: camera centers, meters.
+
+    Raises:
+        CaptureError: the file cannot be read, or a row is malformed; names the line.
+    """
+    positions = {}
+    try:
+        with open(path, encoding="utf-8-sig", newline="") as stream:
+            reader = csv.DictReader(stream, skipinitialspace=True)
+            for row in reader:
+                try:
+                    values = np.array([float(row[axis]) for axis in "xyz"])
+                    if not np.isfinite(values).all():
+                        raise ValueError
+                    positions[row["image"].strip()] = values
+                except (KeyError, TypeError, ValueError, AttributeError):
+                    found = f"found {dict(row)}"[:200]
+                    raise CaptureError(f"{path}, line {reader.line_num}: {found}, expected image,x,y,z.") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise CaptureError(f"{path}: cannot be read as a CSV table ({error}).") from None
+    return positions
+
+
+def _upright(image: pycolmap.Image, quarter_turns: int) -> Floats:
+    """Return world_from_cam (4, 4) of the camera as if it had been held upright."""
+    pose = image.cam_from_world().inverse()
+    cos, sin = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarter_turns]
+    turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
+    return make_pose(pose.rotation.matrix() @ turn, pose.translation)
+
+
+def _rotation_to_z(up: Floats) -> Floats:
+    """Return the smallest rotation (3, 3) that turns a unit vector to z."""
+    v, c = np.cross(up, [0.0, 0.0, 1.0]), up[2]
+    if c < -1 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1 + c))
+
+
+def _point(model: pycolmap.Reconstruction, images: Mapping[str, pycolmap.Image], text: str) -> Floats:
+    """Return the point (3,) at `IMAGE:x,y`, at the depth of the model's points near the pixel; or a camera's center."""
+    name, colon, pixel = text.rpartition(":")
+    image = images.get(name if colon else text)
+    try:
+        xy = np.array([float(value) for value in pixel.split(",")]) if colon else np.zeros(2)
+    except ValueError:
+        xy = np.zeros(0)
+    if image is None or xy.shape != (2,):
+        some = ", ".join(list(images)[:3])
+        raise ManifestError(
+            f"distance: found {text!r}, expected IMAGE or IMAGE:x,y with an image of the model: {some}."
+        )
+    if not colon:
+        return np.asarray(image.projection_center())
+    camera, world_from_cam = image.camera, image.cam_from_world().inverse()
+    assert camera is not None
+    seen = [point for point in image.points2D if point.has_point3D()]
+    away = np.linalg.norm(np.array([point.xy for point in seen]).reshape(-1, 2) - xy, axis=1)
+    near = [seen[index] for index in np.argsort(away, kind="stable")[:5] if away[index] < NEAR_PX * camera.width]
+    if not near:
+        raise ManifestError(
+            f"distance: the model has no point near {text}. Choose a corner or a pattern, no plain area."
+        )
+    depths = np.array([(image.cam_from_world() * model.points3D[point.point3D_id].xyz)[2] for point in near])
+    if depths.max() > MAX_DEPTHS * depths.min():
+        apart = 100 * (depths.max() / depths.min() - 1)
+        found = f"distance: points near {text} are at depths that differ by {apart:.0f} %"
+        raise ManifestError(f"{found}. Choose a pixel away from edges of objects.")
+    ray = np.asarray(camera.cam_from_img(xy[None]))[0]
+    return np.asarray(world_from_cam * (np.append(ray, 1.0) * np.median(depths)))
+
+
+def east_north_up(positions: Floats, origin: Floats) -> Floats:
+    """Return positions (N, 3), latitude, longitude (degrees) and altitude (meters), in the local frame at `origin`.
+
+    WGS 84 to Earth-centered, Earth-fixed coordinates and to local ones, B. Hofmann-Wellenhof et al., "GNSS", 2008.
+    """
+
+    def fixed(geo: Floats) -> Floats:
+        latitude, longitude, altitude = np.radians(geo[..., 0]), np.radians(geo[..., 1]), geo[..., 2]
+        square = _FLATTENING * (2 - _FLATTENING)
+        normal = _EARTH_M / np.sqrt(1 - square * np.sin(latitude) ** 2)
+        flat = (normal + altitude) * np.cos(latitude)
+        z = (normal * (1 - square) + altitude) * np.sin(latitude)
+        return np.stack([flat * np.cos(longitude), flat * np.sin(longitude), z], axis=-1)
+
+    lat, lon = np.radians(origin[:2])
+    axes = np.array([
+        [-np.sin(lon), np.cos(lon), 0.0],
+        [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
+        [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
+    ])  # fmt: skip
+    return (fixed(positions) - fixed(origin)) @ axes.T

@@ -1,0 +1,235 @@
+"""Gather photographs for a reconstruction: files, folders and frames of videos, with what their EXIF tags tell."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import PIL.Image
+import pycolmap
+from numpy.typing import NDArray
+from tqdm.auto import tqdm
+
+from toolkit.capture.images import EXIF_CAMERA, HEADER_ERRORS, ORIENTATION, exif_camera, read_header, read_number
+from toolkit.errors import CaptureError, ImageError
+from toolkit.exchange.drafts import IMAGE_SUFFIXES, list_images
+from toolkit.files import write_atomic
+from toolkit.scene.query import FOCAL_PRIOR
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+OTHER_SUFFIXES = (".webp", ".tif", ".tiff", ".bmp", ".gif", ".jp2", ".heic", ".heif", ".avif")
+"""Formats that are converted to PNG; HEIC needs the package pillow-heif."""
+STEP = 0.06  # motion of the image between chosen frames of a video, in multiples of its width
+_SMALL = 320  # width of the frames whose motion is measured, pixels
+_GPS = 0x8825
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A photograph of a reconstruction."""
+
+    name: str  # relative path that it gets in the capture
+    path: Path  # the JPEG or PNG file
+    exif: Mapping[int, Any]
+    geo: tuple[float, float, float] | None  # latitude and longitude, degrees, and altitude, meters
+
+    @property
+    def quarter_turns(self) -> int:
+        """Counter-clockwise quarter turns that make the image upright, from the orientation in EXIF."""
+        return {3: 2, 6: 3, 8: 1}.get(int(read_number(self.exif, ORIENTATION)), 0)
+
+
+def gather(sources: Sequence[Path], made: Path, fps: float | None = None) -> tuple[list[Photograph], dict[str, str]]:
+    """Return the photographs of files, folders and videos, and the reason for each that cannot be read, by name.
+
+    Frames of videos, and photographs in other formats than JPEG and PNG, are written to the folder `made`, once.
+
+    Raises:
+        CaptureError: a source is missing or is no image or video, or two photographs would have one name.
+    """
+    photographs, unreadable = list[Photograph](), dict[str, str]()
+    for name, source in _files(sources, made, fps):
+        try:
+            name, path = _converted(name, source, made)
+            _, exif = read_header(path)
+            photographs.append(Photograph(name, path, exif, _position(path)))
+        except ImageError as error:
+            unreadable[name] = str(error)
+    twice = {item.name for item in photographs}
+    if len(twice) < len(photographs):
+        raise CaptureError(f"{', '.join(map(str, sources))}: two photographs have one name. Rename a file or folder.")
+    return photographs, unreadable
+
+
+def _files(sources: Sequence[Path], made: Path, fps: float | None) -> Iterator[tuple[str, Path]]:
+    """Yield name and file of each image. Names start with the folder's name if there are several sources."""
+    for source in sources:
+        prefix = f"{source.stem if source.is_file() else source.name}/" if len(sources) > 1 else ""
+        if source.is_dir():
+            for name in list_images(source, (*IMAGE_SUFFIXES, *OTHER_SUFFIXES, *VIDEO_SUFFIXES)):
+                if (source / name).absolute().is_relative_to(made.absolute().parents[1]):
+                    continue  # the capture is in the folder of the photographs, from a command that was stopped
+                if name.lower().endswith(VIDEO_SUFFIXES):
+                    video = Path(name).with_suffix("").as_posix()
+                    yield from _frames(source / name, made, f"{prefix}{video}/", fps)
+                else:
+                    yield prefix + name, source / name
+        elif source.suffix.lower() in VIDEO_SUFFIXES:
+            yield from _frames(source, made, f"{source.stem}/", fps)
+        elif source.is_file() and source.suffix.lower() in (*IMAGE_SUFFIXES, *OTHER_SUFFIXES):
+            yield source.name, source
+        else:
+            expected = ", ".join((*IMAGE_SUFFIXES, *OTHER_SUFFIXES, *VIDEO_SUFFIXES))
+            raise CaptureError(
+                f"{source}: no folder, image or video. Expected a folder, or a file ending in {expected}."
+            )
+
+
+def _converted(name: str, path: Path, made: Path) -> tuple[str, Path]:
+    """Return name and file of a JPEG or PNG with the same pixels and EXIF tags."""
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        return name, path
+    target = made / f"{name}.png"
+    if not target.exists():
+        try:
+            if path.suffix.lower() in (".heic", ".heif"):
+                import pillow_heif
+
+                pillow_heif.register_heif_opener()
+            with PIL.Image.open(path) as image:
+                pixels, exif = image.convert("RGB"), image.getexif()  # in this order: Pillow turns a TIFF upright
+            with write_atomic(target) as temporary:
+                pixels.save(temporary, exif=exif)
+        except ModuleNotFoundError:
+            raise ImageError("HEIC cannot be read: pip install pillow-heif, or convert it to JPEG") from None
+        except HEADER_ERRORS as error:
+            raise ImageError(f"cannot be read as an image ({error})") from None
+    return f"{name}.png", target
+
+
+# Videos
+
+
+def _frames(video: Path, made: Path, prefix: str, fps: float | None) -> Iterator[tuple[str, Path]]:
+    """Yield names and files of the frames of a video, which are written once."""
+    folder = made / prefix
+    done = folder / f".{'motion' if fps is None else fps}-{video.stat().st_mtime_ns}"
+    if not done.exists():
+        for old in [*folder.glob("*.jpg"), *folder.glob(".*-*")]:
+            old.unlink()
+        for number, frame in choose_frames(video, fps):
+            with write_atomic(folder / f"frame_{number:06d}.jpg") as temporary:
+                cv2.imwrite(str(temporary), frame, [cv2.IMWRITE_JPEG_QUALITY, 97])
+        folder.mkdir(parents=True, exist_ok=True)
+        done.touch()
+    for path in sorted(folder.glob("frame_*.jpg")):
+        yield prefix + path.name, path
+
+
+def choose_frames(video: Path, fps: float | None = None) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Yield number and pixels (H, W, 3) BGR of the sharpest frame of each stretch of a video.
+
+    A stretch ends when the image has moved by `STEP` since the last chosen frame, or after 1 / `fps` seconds. Of its
+    second half, the frame with the largest variance of the Laplacian is taken, so that neighbors differ.
+
+    Raises:
+        CaptureError: OpenCV cannot read the video.
+    """
+    reader = cv2.VideoCapture(str(video))
+    total, rate = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)), reader.get(cv2.CAP_PROP_FPS) or 30.0
+    found, score, start = 0, -1.0, 0
+    best: tuple[int, NDArray[np.uint8], NDArray[np.uint8]] | None = None
+    reference: NDArray[np.uint8] | None = None
+    for number in tqdm(range(max(total, 1)), desc=video.name, unit="frame"):
+        ok, frame = reader.read()
+        if not ok:
+            break
+        found += 1
+        size = _SMALL, max(1, round(_SMALL * frame.shape[0] / frame.shape[1]))
+        gray = np.asarray(
+            cv2.cvtColor(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY), np.uint8
+        )
+        if reference is None:  # the first frame opens the video
+            share = 1.0
+        else:
+            share = _motion(reference, gray) / STEP if fps is None else (number - start) * fps / rate
+        sharp = float(cv2.Laplacian(gray, cv2.CV_64F).var())
+        if share >= 0.5 and sharp > score:
+            best, score = (number, np.asarray(frame, np.uint8), gray), sharp
+        if share >= 1 and best is not None:
+            yield best[0], best[1]
+            start, reference, best, score = number, best[2], None, -1.0
+    reader.release()
+    if not found:
+        raise CaptureError(f"{video}: no frame can be read. Convert it to H.264 in an .mp4 file.")
+
+
+def _motion(before: NDArray[np.uint8], now: NDArray[np.uint8]) -> float:
+    """Return the median motion of corners between two gray frames, in multiples of the width; inf if they are lost."""
+    corners = cv2.goodFeaturesToTrack(before, 150, 0.01, 7)
+    if corners is None or not len(corners):  # nothing to see
+        return 0.0
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, np.zeros_like(corners))
+    kept = found.ravel() == 1
+    if kept.mean() < 0.5:
+        return np.inf
+    return float(np.median(np.linalg.norm((moved - corners)[kept, 0], axis=1)) / before.shape[1])
+
+
+# EXIF
+
+
+def initial_cameras(
+    photographs: Iterable[Photograph], given: pycolmap.Camera | None
+) -> tuple[list[int], list[pycolmap.Camera]]:
+    """Return for each photograph the number of its camera, and the cameras before they are estimated.
+
+    Photographs of one folder with one size, make, model and focal length in EXIF share a camera. Without these tags,
+    they do so only if all in the folder have one size, as those that a person collected have several.
+    """
+    photographs = list(photographs)
+    sizes = [read_header(item.path)[0] for item in photographs]
+    folders = [Path(item.name).parent for item in photographs]
+    mixed = {
+        folder: len({size for size, other in zip(sizes, folders, strict=True) if other == folder}) > 2
+        for folder in set(folders)
+    }
+    keys: dict[Any, int] = {}
+    numbers, cameras = list[int](), list[pycolmap.Camera]()
+    for index, (item, size, folder) in enumerate(zip(photographs, sizes, folders, strict=True)):
+        tags = tuple(str(item.exif.get(tag, "")) for tag in EXIF_CAMERA)
+        key = folder, size, tags, index if mixed[folder] and not any(tags) else None
+        if key not in keys:
+            keys[key] = len(cameras)
+            cameras.append(given if given is not None else _initial(item.path, size))
+        numbers.append(keys[key])
+    return numbers, cameras
+
+
+def _initial(path: Path, size: tuple[int, int]) -> pycolmap.Camera:
+    width, height = size
+    try:
+        focal_px, known = exif_camera(path)[0].mean_focal_length(), True
+    except ImageError:
+        focal_px, known = FOCAL_PRIOR * max(size), False
+    params = [focal_px, width / 2, height / 2, 0.0]
+    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
+    camera.has_prior_focal_length = known
+    return camera
+
+
+def _position(path: Path) -> tuple[float, float, float] | None:
+    """Return latitude, longitude and altitude of the GPS tags; None without them."""
+    try:
+        with PIL.Image.open(path) as image:
+            tags = image.getexif().get_ifd(_GPS)
+        degrees = [float(np.dot([float(value) for value in tags[key]], [1, 1 / 60, 1 / 3600])) for key in (2, 4)]
+        latitude, longitude = (
+            value * (-1 if str(tags[key]).upper() in "SW" else 1) for key, value in zip((1, 3), degrees, strict=True)
+        )
+        altitude = float(tags.get(6, 0.0)) * (-1 if tags.get(5) in (1, b"\x01") else 1)
+    except (*HEADER_ERRORS, KeyError, TypeError, ZeroDivisionError):
+        return None
+    return (latitude, longitude, altitude) if np.isfinite([latitude, longitude, altitude]).all() else None

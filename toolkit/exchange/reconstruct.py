@@ -1,0 +1,499 @@
+"""Reconstruct the poses of photographs: structure from motion with the toolkit's features and COLMAP's mapper.
+
+The work is in `CAPTURE/reconstruction/`: features and matches, which a stopped reconstruction finds again, COLMAP's
+database, and all models in COLMAP's format. The capture gets the largest model. Its sessions have the features in
+`proc/features`, from where a run takes them, and `proc/reconstruction.json`, which says how good the model is.
+"""
+
+import json
+import logging
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from tqdm.auto import tqdm
+
+from toolkit.capture import Session, parse_camera
+from toolkit.capture.cameras import camera_text
+from toolkit.capture.images import default_workers, prefetch
+from toolkit.embedders.vlad import Vlad
+from toolkit.errors import CaptureError, ManifestError, WeightsError
+from toolkit.exchange.drafts import SUBSESSION, Draft, DraftImage, ImportReport, start, write_drafts
+from toolkit.exchange.georeference import place, read_positions
+from toolkit.exchange.photographs import Photograph, gather, initial_cameras
+from toolkit.features.features import KINDS, LocalFeatures
+from toolkit.features.matching import (
+    LocalMethod,
+    MutualMatcher,
+    PairMatches,
+    create_local_methods,
+    resolve_auto,
+    unit_descriptors,
+)
+from toolkit.features.sift import SiftExtractor
+from toolkit.features.stores import FeatureStore, extract_session, match_sessions
+from toolkit.features.verification import epipolar_matches
+from toolkit.files import IMPORTED, link_folder, write_text
+from toolkit.geometry import Floats, Ints, make_pose, unit
+from toolkit.manifest import LocalizeSettings, SiftSettings
+from toolkit.store.items import Items, heals
+from toolkit.threads import one_thread
+
+log = logging.getLogger(__name__)
+
+FOLDER = "reconstruction"
+RECORD = "proc/reconstruction.json"
+ALL_PAIRS = 60  # up to this number of photographs, all pairs are matched
+NEIGHBORS, SIMILAR = 10, 20  # else each photograph with so many next ones in its folder, and so many that look similar
+MIN_INLIERS = 15  # of a pair that counts
+MIN_MODEL = 3  # photographs of a model
+ESCALATED = 6  # similar ones of each photograph that SIFT leaves out, with which learned features are tried
+RATIO = 0.8  # of SIFT's matches; fewer of them are wrong than with the larger one for queries
+LOSS_PX, MAX_ERROR_PX, MIN_ANGLE_DEG = 0.5, 4.0, 1.5
+"""Of the last bundle adjustment: scale of the Cauchy loss and largest error of an observation, in pixels of the image
+where features are detected, and smallest triangulation angle."""
+FEW_PAIRS, STRONGEST = 100, 2048  # if there are more pairs, only so many SIFT features of each photograph are matched
+MIN_POINTS = 30  # points of a photograph in a model; COLMAP requires as many when it estimates a pose
+_BATCH = 64  # pairs that are matched at once
+
+
+@dataclass
+class Reconstruction:
+    """The result of `reconstruct`."""
+
+    reports: list[ImportReport]
+    record: dict[str, Any]
+    points: Floats  # (P, 3) in the world
+    colors: NDArray[np.uint8]  # (P, 3) RGB
+    notes: list[str] = field(default_factory=list)
+
+    camera: str = ""  # option for queries of the same camera, if the photographs have one
+
+    def text(self) -> str:
+        """Return what was made, as text."""
+        return "\n".join([*self.notes, *(report.text() for report in self.reports)])
+
+
+class _Mutual(MutualMatcher):
+    """`MutualMatcher` of the strongest features, with a thread per core."""
+
+    batch_size = _BATCH
+
+    strongest: int | None = None
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {**super().settings, "strongest": self.strongest}
+
+    def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
+        distinct = {id(features): features for pair in pairs for features in pair}
+        units = {
+            key: unit_descriptors(features.descriptors[: self.strongest], self.shorten)
+            for key, features in distinct.items()
+        }
+        return list(prefetch(lambda pair: self.match_unit(*(units[id(one)] for one in pair)), pairs, default_workers()))
+
+
+class _Work:
+    """Photographs with features and verified matches, in the folder of the reconstruction."""
+
+    def __init__(self, folder: Path, device: str, photographs: list[Photograph], given: pycolmap.Camera | None) -> None:
+        self.folder, self.photographs, self.fixed = folder, photographs, given is not None
+        self.camera_of, self.cameras = initial_cameras(photographs, given)
+        session = folder / "sessions" / f"{device}_map"
+        shutil.rmtree(session, ignore_errors=True)
+        draft = Draft(session, folder, "link", sources={item.name: item.path for item in photographs})
+        for item, number in zip(photographs, self.camera_of, strict=True):
+            draft.images.append(
+                DraftImage(item.name, self.cameras[number], f"{SUBSESSION}/cam_{number + 1}", item.name)
+            )
+        draft.leave_out()
+        self.unusable = {row["image"]: row["status"] for row in draft.rows}
+        draft.write()
+        self.session = Session.open(session)
+        index = {item.name: number for number, item in enumerate(photographs)}
+        self.photograph_of = [index[name.partition(IMPORTED)[2]] for name in self.session.image_names]
+        order = np.argsort(self.photograph_of)
+        self.names = [self.session.image_names[row] for row in order]
+        """Names of the images in the stores, in the order of the photographs."""
+        self.photographs = [photographs[self.photograph_of[row]] for row in order]
+        self.camera_of = [self.camera_of[self.photograph_of[row]] for row in order]
+        self.kinds: list[tuple[LocalMethod, FeatureStore]] = []
+        self.pairs: list[dict[tuple[int, int], Ints]] = []
+        """For each kind, the verified matches (K, 2) of pairs of images."""
+        self.matched: dict[tuple[int, int], int] = {}
+        """Number of matches of each pair before verification."""
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def extract(self, method: LocalMethod, images: Sequence[int]) -> None:
+        rows = np.array([self.session.row_of_name[self.names[image]] for image in images])
+        turns = np.zeros(len(self.session.images), np.int64)
+        turns[rows] = [self.photographs[image].quarter_turns for image in images]
+        store = extract_session(
+            self.session, self.folder / "features", method.extractor, rows, default_workers(), turns=turns
+        )
+        for name, reason in store.failed.items():
+            self.unusable[name.partition(IMPORTED)[2]] = reason
+        self.kinds.append((method, store))
+        self.pairs.append({})
+
+    def keypoints(self, image: int, kind: int) -> Floats:
+        store = self.kinds[kind][1]
+        name = self.names[image]
+        return np.asarray(store[name].keypoints, np.float64) if name in store else np.zeros((0, 2))
+
+    @cached_property
+    def similarity(self) -> Floats:
+        """(N, N) similarity of images by VLAD, -1 on the diagonal and for images without features."""
+        store = self.kinds[0][1]
+        names = [name for name in self.names if name in store]
+        vlad = Vlad.learn(
+            lambda: tqdm((store[name] for name in names), "vocabulary", len(names), unit="image"), len(names)
+        )
+        vectors = np.zeros((len(self), vlad.dim), np.float32)
+        rows = [row for row, name in enumerate(self.names) if name in store]
+        vectors[rows] = list(prefetch(lambda name: vlad.embed([store[name]])[0], names, default_workers()))
+        vectors = unit(vectors, 1e-9)
+        similarity = (vectors @ vectors.T).astype(np.float64)
+        np.fill_diagonal(similarity, -1)
+        return similarity
+
+    def choose_pairs(self) -> list[tuple[int, int]]:
+        """Return the pairs to match: all, or those of neighbors and of images that look similar."""
+        count = len(self)
+        if count <= ALL_PAIRS:
+            return [(i, j) for i in range(count) for j in range(i + 1, count)]
+        folders = [Path(item.name).parent for item in self.photographs]
+        pairs = {
+            (i, j)
+            for i in range(count)
+            for j in range(i + 1, min(i + 1 + NEIGHBORS, count))
+            if folders[i] == folders[j]
+        }
+        for i, similar in enumerate(np.argsort(-self.similarity, axis=1, kind="stable")[:, :SIMILAR].tolist()):
+            pairs |= {(min(i, j), max(i, j)) for j in similar}
+        return sorted(pairs)
+
+    def match(self, kind: int, pairs: Sequence[tuple[int, int]]) -> None:
+        """Match pairs and keep the matches that agree with one relative pose of their cameras."""
+        method, store = self.kinds[kind]
+        named = [(self.names[i], self.names[j]) for i, j in pairs]
+        stored = match_sessions((store, store), named, method.matcher, self.folder / "matches", (self.session.id,) * 2)
+        keypoints = lru_cache(512)(lambda image: self.keypoints(image, kind))
+
+        def verify(pair: tuple[int, int]) -> tuple[int, Ints]:
+            names = [self.names[image] for image in pair]
+            if not all(name in store for name in names):
+                return 0, np.zeros((0, 2), np.int64)
+            matches = stored[names[0], names[1]]
+            cameras = [self.cameras[self.camera_of[image]] for image in pair]
+            sizes = [(camera.width, camera.height) for camera in cameras]
+            a, b = (keypoints(image)[indices] for image, indices in zip(pair, matches.indices.T, strict=True))
+            inliers = epipolar_matches(sizes[0], a, sizes[1], b, matches.scores, tests=len(pairs))
+            return len(matches), matches.indices[inliers]
+
+        with one_thread():
+            bar = tqdm(prefetch(verify, pairs, default_workers()), "verify", len(pairs), unit="pair")
+            for pair, (count, inliers) in zip(pairs, bar, strict=True):
+                self.matched[pair] = max(count, self.matched.get(pair, 0))
+                if len(inliers) >= MIN_INLIERS:
+                    self.pairs[kind][pair] = inliers
+
+    def inliers(self) -> Ints:
+        """(N, N) numbers of verified matches."""
+        counts = np.zeros((len(self), len(self)), np.int64)
+        for found in self.pairs:
+            for (i, j), indices in found.items():
+                counts[i, j] += len(indices)
+        return counts + counts.T
+
+    def write_database(self) -> Path:
+        """Write COLMAP's database: cameras, images, keypoints and verified matches of all kinds."""
+        path = self.folder / "database.db"
+        path.unlink(missing_ok=True)
+        offsets = np.zeros((len(self.kinds) + 1, len(self)), np.int64)
+        with pycolmap.Database.open(str(path)) as database:
+            ids = []
+            for camera in self.cameras:
+                ids.append(database.write_camera(camera))
+                rig = pycolmap.Rig()
+                rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, ids[-1]))
+                database.write_rig(rig)
+            for image, name in enumerate(self.names):
+                camera_id = ids[self.camera_of[image]]
+                number = database.write_image(pycolmap.Image(name=name, camera_id=camera_id, image_id=image + 1), True)
+                frame = pycolmap.Frame(rig_id=camera_id)
+                frame.add_data_id(pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id), number))
+                database.write_frame(frame)
+                keypoints = [self.keypoints(image, kind) for kind in range(len(self.kinds))]
+                offsets[1:, image] = np.cumsum([len(part) for part in keypoints])
+                database.write_keypoints(number, np.concatenate(keypoints).astype(np.float32))
+            both: dict[tuple[int, int], list[Ints]] = {}
+            for kind, found in enumerate(self.pairs):
+                for pair, indices in found.items():
+                    both.setdefault(pair, []).append(indices + offsets[kind, list(pair)])
+            for (i, j), parts in both.items():
+                geometry = pycolmap.TwoViewGeometry()
+                geometry.config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
+                geometry.inlier_matches = np.concatenate(parts).astype(np.uint32)
+                database.write_matches(i + 1, j + 1, geometry.inlier_matches)
+                database.write_two_view_geometry(i + 1, j + 1, geometry)
+        return path
+
+    def map(self, mapper: str = "incremental") -> list[pycolmap.Reconstruction]:
+        """Return the models, the largest first; of the others, those that have a photograph that it lacks."""
+        database, out = self.write_database(), self.folder / "models"
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir()
+        images = self.session.path.parent
+        with tqdm(total=len(self), desc="map", unit="image") as bar, _quiet():
+            if mapper == "global":
+                chosen = pycolmap.GlobalPipelineOptions(min_model_size=MIN_MODEL, random_seed=0)
+                models = pycolmap.global_mapping(database, images, out, chosen)
+            else:
+                options = self._incremental_options()
+                models = pycolmap.incremental_mapping(
+                    database, images, out, options,
+                    initial_image_pair_callback=lambda: bar.update(2), next_image_callback=bar.update,
+                )  # fmt: skip
+            ordered = sorted(models.values(), key=lambda model: -model.num_reg_images())
+            inside = {image for model in ordered[:1] for image in model.reg_image_ids()}
+            kept = ordered[:1] + [model for model in ordered[1:] if not {*model.reg_image_ids()} <= inside]
+            for model in tqdm(kept, "refine", unit="model"):
+                self._refine(model)
+        return [model for model in kept if model.num_reg_images() >= MIN_MODEL]
+
+    def _incremental_options(self) -> pycolmap.IncrementalPipelineOptions:
+        """Return options that are less precise on the way than COLMAP's, in half of the time, as `_refine` follows."""
+        options = pycolmap.IncrementalPipelineOptions(min_model_size=MIN_MODEL, random_seed=0)
+        options.num_threads = default_workers()
+        options.structure_less_registration_fallback = False
+        options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
+        options.ba_global_function_tolerance = options.ba_local_function_tolerance = 1e-4
+        options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
+        if self.fixed:
+            options.ba_refine_focal_length = options.ba_refine_extra_params = False
+            options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+        return options
+
+    def _refine(self, model: pycolmap.Reconstruction) -> None:
+        """Adjust poses, points and cameras under a robust loss, which halves errors (STRECHA), and drop outliers."""
+        scale = max(
+            1.0, max(max(camera.width, camera.height) for camera in self.cameras) / SiftSettings().max_long_side
+        )
+        options = pycolmap.BundleAdjustmentOptions(print_summary=False, min_track_length=2)
+        options.refine_focal_length = options.refine_extra_params = not self.fixed
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.loss_function_scale = LOSS_PX * scale
+        options.ceres.solver_options.max_num_iterations = 50
+        for _ in range(2):
+            config = pycolmap.BundleAdjustmentConfig()
+            for number in model.reg_image_ids():
+                config.add_image(number)
+            config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+            pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+            pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX * scale, MIN_ANGLE_DEG)
+            for image in list(model.images.values()):  # a wrong pose keeps few points
+                if image.has_pose and image.num_points3D < MIN_POINTS:
+                    model.deregister_frame(image.frame_id)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Print only errors of COLMAP."""
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+@heals
+def reconstruct(
+    sources: Sequence[str | Path], capture: str | Path, device: str = "ios", hold_out: int = 0,
+    fps: float | None = None, camera: str | None = None, distance: tuple[str, str, float] | None = None,
+    positions: str | Path | None = None, mapper: str = "incremental", placing: str = "link",
+) -> Reconstruction:  # fmt: skip
+    """Make a map session from photographs without poses, and with `hold_out` a query session with ground truth.
+
+    Args:
+        sources: image files, folders of images and videos.
+        capture: folder of the capture; created if it does not exist.
+        device: the sessions are `<device>_map` and `<device>_query`.
+        hold_out: every `hold_out`-th photograph becomes a query; 0: none.
+        fps: frames per second of videos; None: chosen by motion.
+        camera: intrinsics of all photographs, `MODEL, width, height, parameter, ...`, kept as they are; None:
+            estimated, from EXIF if it has a focal length.
+        distance: two points, `IMAGE:x,y` in pixels, or images for the centers of their cameras, and the meters
+            between.
+        positions: CSV file with the columns image, x, y, z: known camera centers, meters.
+        mapper: COLMAP's `incremental` or `global` mapper.
+        placing: `link` to the photographs, or `copy` them.
+
+    Raises:
+        CaptureError: no photograph, no two that fit together, a session that exists, or a malformed file.
+        ManifestError: a malformed argument.
+    """
+    if hold_out == 1 or hold_out < 0:
+        raise ManifestError(f"hold-out: found {hold_out}, expected 2 or more, or 0.")
+    if mapper not in ("incremental", "global"):
+        raise ManifestError(f"mapper: found {mapper!r}, expected incremental or global.")
+    folder = Path(capture) / FOLDER
+    splits = ("map", "query") if hold_out else ("map",)
+    drafts = [start(capture, device, split, folder, placing) for split in splits]
+    photographs, unreadable = gather(list(map(Path, sources)), folder / "images", fps)
+    known = read_positions(Path(positions)) if positions is not None else None
+    given = None
+    if camera is not None:
+        try:
+            given = parse_camera("camera", camera)
+        except ValueError as error:
+            raise ManifestError(f"camera: {error}") from None
+    if not photographs:
+        raise CaptureError(f"{sources[0]}: no photograph can be read. First: {next(iter(unreadable.items()))}")
+    if hold_out > len(photographs):
+        raise ManifestError(f"hold-out: found {hold_out}, but there are {len(photographs)} photographs.")
+    work = _Work(folder, device, photographs, given)
+    work.unusable |= unreadable
+    matcher = _Mutual(RATIO, shorten=KINDS["sift"].shorten)
+    work.extract(LocalMethod("sift", SiftExtractor(), matcher), range(len(work)))
+    pairs = work.choose_pairs()
+    matcher.strongest = STRONGEST if len(pairs) > FEW_PAIRS else None
+    work.match(0, pairs)
+    models = work.map(mapper)
+    notes = _escalate(work, models)
+    if len(work.kinds) > 1 and any(work.pairs[1]):
+        models = work.map(mapper)
+    if not models:
+        worst = "; ".join(f"{name}: {reason}" for name, reason in list(_reasons(work, models).items())[:3])
+        raise CaptureError(f"{sources[0]}: no two of {len(work)} photographs fit together. {worst}.")
+    model = models[0]
+    geo = {item.name: item.geo for item in work.photographs if item.geo is not None}
+    placed = place(model, {item.name: item.quarter_turns for item in work.photographs}, geo, distance, known)
+    folder_of_models = folder / "models"
+    shutil.rmtree(folder_of_models)
+    for number, each in enumerate(models):
+        (folder_of_models / str(number)).mkdir(parents=True)
+        each.write(str(folder_of_models / str(number)))
+    sensors = {
+        camera_id: f"{SUBSESSION}/cam_{number}" for number, camera_id in enumerate(sorted(model.cameras), start=1)
+    }
+    images = {image.name: image for image in model.images.values() if image.has_pose}
+    for number, (name, item) in enumerate(zip(work.names, work.photographs, strict=True)):
+        if name in images:
+            draft = drafts[1 if hold_out and number % hold_out == hold_out - 1 else 0]
+            image = images[name]
+            draft.images.append(DraftImage(item.name, image.camera, sensors[image.camera_id], item.name))
+            pose = image.cam_from_world().inverse()
+            draft.poses[item.name] = make_pose(pose.rotation.matrix(), pose.translation)
+            draft.sources[item.name] = item.path
+    reasons = _reasons(work, models)
+    drafts[0].rows += [{"image": name, "status": reason} for name, reason in reasons.items()]
+    for draft in drafts:
+        draft.unit = placed.unit
+    sizes = [each.num_reg_images() for each in models]
+    record = {
+        "photographs": len(photographs) + len(unreadable), "registered": sizes[0], "other models": sizes[1:],
+        "mapper": mapper, "features": [method.name for method, _ in work.kinds],
+        "points": model.num_points3D(), "track length": model.compute_mean_track_length(),
+        "reprojection error, px": model.compute_mean_reprojection_error(), **placed.record,
+    }  # fmt: skip
+    reports = write_drafts(*drafts)
+    for report in reports:
+        write_text(report.session / RECORD, json.dumps(record, indent=1) + "\n")
+        _hand_over(work, report.session)
+    focal = ", ".join(f"{each.mean_focal_length():.0f}" for each in list(model.cameras.values())[:5])
+    notes.insert(0, f"{sizes[0]} of {record['photographs']} photographs in the model, {record['points']} points, "
+                 f"reprojection error {record['reprojection error, px']:.2f} px, focal lengths {focal} px")  # fmt: skip
+    if sizes[1:]:
+        where = ", ".join(
+            f"{size} in {folder_of_models / str(number)}" for number, size in enumerate(sizes[1:], start=1)
+        )
+        notes.append(f"{len(sizes) - 1} other models do not connect to it: {where}")
+    points = list(model.points3D.values())
+    xyz, rgb = np.array([point.xyz for point in points]), np.array([point.color for point in points], np.uint8)
+    notes += placed.notes
+    option = f" --camera '{camera_text(next(iter(model.cameras.values())))}'" if len(model.cameras) == 1 else ""
+    return Reconstruction(reports, record, xyz.reshape(-1, 3), rgb.reshape(-1, 3), notes, option)
+
+
+def _escalate(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> list[str]:
+    """Match the photographs that are in no model with learned features, each with those that look similar.
+
+    These are matched with each other, too, where SIFT has: only points of two other photographs tell a pose.
+    """
+    inside = {image.name for model in models for image in model.images.values() if image.has_pose}
+    left = [image for image, name in enumerate(work.names) if name not in inside and name in work.kinds[0][1]]
+    if not left:
+        return []
+    settings = resolve_auto(LocalizeSettings())
+    names = [*settings.features.kinds, *settings.features.escalation]
+    if "aliked" not in names:
+        return ["ALIKED is not on this machine, so photographs that SIFT leaves out were not tried with it"]
+    try:
+        (method,) = create_local_methods(settings, ["aliked"])
+    except WeightsError as error:
+        return [f"photographs that SIFT leaves out were not tried with ALIKED: {error}"]
+    pairs = set[tuple[int, int]]()
+    for image in left:
+        others = np.argsort(-work.similarity[image], kind="stable")[:ESCALATED].tolist()
+        pairs |= {(min(image, other), max(image, other)) for other in others if other != image}
+        pairs |= {pair for pair in work.pairs[0] if {*pair} <= {*others}}
+    work.extract(method, sorted({image for pair in pairs for image in pair}))
+    work.match(1, sorted(pairs))
+    return [f"{len(left)} photographs that SIFT left out were tried with ALIKED: {len(work.pairs[1])} pairs match"]
+
+
+def _reasons(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> dict[str, str]:
+    """Return why each photograph that is not in the largest model is left out, by name."""
+    member = {
+        image.name: number
+        for number, model in reversed(list(enumerate(models)))
+        for image in model.images.values()
+        if image.has_pose
+    }
+    inliers, reasons = work.inliers(), dict(work.unusable)
+    inside = np.array([member.get(name) == 0 for name in work.names])
+    for image, (name, item) in enumerate(zip(work.names, work.photographs, strict=True)):
+        if inside[image] or item.name in reasons:
+            continue
+        best = int(inliers[image].argmax())
+        if name in member:
+            size = models[member[name]].num_reg_images()
+            reason = f"not connected: in model {member[name]}, of {size} photographs"
+        elif not inliers[image].any():
+            most = max((count for pair, count in work.matched.items() if image in pair), default=0)
+            reason = f"no matches: at most {most} with another photograph, and these agree with no motion of the camera"
+        elif not inliers[image][inside].any():
+            other = work.photographs[best].name
+            reason = (
+                f"not connected: matches {np.count_nonzero(inliers[image])} photographs, as {other}, none in the model"
+            )
+        else:
+            reason = f"no pose: its {inliers[image][inside].max()} matches with the model's photographs agree with none"
+        reasons[item.name] = reason
+    return reasons
+
+
+def _hand_over(work: _Work, session: Path) -> None:
+    """Give the features of a session's images to the session, where `extract_session` finds them."""
+    for _, store in work.kinds:
+        target = session / "proc" / "features" / store.path.name
+        if session.name == work.session.id:
+            link_folder(store.path, target)
+            continue
+        with Items(store.path) as source, Items(target, source.made_by) as items:
+            for name in Session.open(session).image_names:
+                made = f"{work.session.id}/{name.partition('/')[2]}"
+                if made in store:
+                    items.add(name, source.source(made), source[made])
