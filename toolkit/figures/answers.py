@@ -174,7 +174,8 @@ class Answer:
 
     @cached_property
     def figure(self) -> "Figure":
-        title = f"{self.headline}\n{shown_name(self.name, 110)}\n{textwrap.fill(self.reason, 130)}"
+        headline = textwrap.shorten(self.headline, 110, placeholder=" …")
+        title = f"{headline}\n{shown_name(self.name, 110)}\n{textwrap.fill(self.reason, 130)}"
         return draw_answers([self], title)
 
     @property

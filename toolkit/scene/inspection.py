@@ -175,7 +175,9 @@ class WorstQueries:
         self.names = [f"{pair.label}: {shown_name(pair.names[number])}" for pair, number in self._queries]
 
     def look(self, rank: int | str = 0) -> Answer:
-        """Return a query by its rank, 0 or `worst` for the worst of all, or by the name of one of its images.
+        """Return a query by its rank, 0 for the worst of all, or by the name of one of its images.
+
+        `worst` is the worst one with matches, as those without, such as a torn file, have little to show.
 
         A query that was localized in several maps is returned where it is worst.
 
@@ -188,7 +190,12 @@ class WorstQueries:
             session = pair.localized.query_session
             first.setdefault((session.id, rows.tobytes()), at)
             images |= {session.image_name(row): first[session.id, rows.tobytes()] for row in rows.tolist()}
-        pair, number, _ = queries[find_query(0 if rank == WORST else rank, images, len(queries))]
+        if rank == WORST:
+            tables = (pair.localized.results.table for pair, _ in self._queries)
+            matched = (table.get("num_matches", table["timestamp"]).iloc[number]
+                       for table, (_, number) in zip(tables, self._queries, strict=True))  # fmt: skip
+            rank = next((at for at, count in enumerate(matched) if count > 0), 0)
+        pair, number, _ = queries[find_query(rank, images, len(queries))]
         return pair.look(number)
 
 

@@ -117,7 +117,7 @@ class Run:
         """Return how a query was localized, with its stored matches.
 
         Args:
-            name: of one of its images, see `__getitem__`; or `worst`, the worst query.
+            name: of one of its images, see `__getitem__`; or `worst`, the worst query with matches.
             map_device: device of the map; None: of the maps that the query was localized in, the one where it is worst.
             scene: name of the capture; None: the only one of the run.
 
