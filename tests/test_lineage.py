@@ -32,7 +32,7 @@ from toolkit.files import (
 from toolkit.notebook import notebook_path
 from toolkit.report.comparison import compare_runs
 from toolkit.report.page import write_report
-from toolkit.scene.inspection import inspect_query
+from toolkit.scene.inspection import InspectedPair
 from toolkit.scene.map import Map
 from toolkit.visualize import visualize_scene
 
@@ -131,11 +131,11 @@ def compared(files: SceneFiles, capture: Path) -> str:
 
 
 def inspected_again(files: SceneFiles, capture: Path) -> str:
-    return str(inspect_query(files.run, files.scene, "ios", "hl").result.what_if())
+    return str(InspectedPair("ios", "hl", files.poses_dir).look().result.what_if())
 
 
 def inspected(files: SceneFiles, capture: Path) -> str:
-    return "" if inspect_query(files.run, files.scene, "ios", "hl").retrieved else "run the localize stage again"
+    return "" if InspectedPair("ios", "hl", files.poses_dir).look().retrieved else "run the localize stage again"
 
 
 def opened(files: SceneFiles, capture: Path) -> str:

@@ -28,7 +28,6 @@ from toolkit.scene.inspection import (
     WorstQueries,
     choose,
     find_query,
-    inspect_query,
 )
 
 
@@ -81,7 +80,7 @@ def panel(figure: object, title: str) -> object:
 
 
 def test_it_shows_what_the_stage_stored(files: SceneFiles, pair: InspectedPair) -> None:
-    one = inspect_query(files.run, files.scene, "ios", "spot", 1)
+    one = pair.look(1)
     row = pd.read_csv(files.poses_csv("ios", "spot")).iloc[1]
     stored = pair.localized.results[1]
     assert one.result.status_text == row["status"]
@@ -246,11 +245,9 @@ def test_names_and_numbers_that_are_none_are_refused(files: SceneFiles, pair: In
     with pytest.raises(ArtifactError, match="2 have an image name that ends in"):
         find_query("b.jpg", {"x/b.jpg": 0, "y/b.jpg": 1, "y/ab.jpg": 2}, 3)
     with pytest.raises(ArtifactError, match=r"no correspondences of queries of 'spt'.*Did you mean .*spot"):
-        inspect_query(files.run, files.scene, "ios", "spt", 0)
+        InspectedPair("ios", "spt", files.poses_dir)
     with pytest.raises(ArtifactError, match="no correspondences"):
         InspectedPair("ios", "spot", tmp_path)
-    with pytest.raises(ArtifactError, match=r"no poses of the scene 'SMAL'.*Known: SMALL"):
-        inspect_query(files.run, "SMAL", "ios", "spot", 0)
 
 
 def test_an_estimate_in_doubt_says_why() -> None:

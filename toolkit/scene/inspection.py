@@ -199,28 +199,6 @@ class WorstQueries:
         return pair.look(number)
 
 
-def inspect_query(run: str | Path, scene: str, map: str, query: str, n: int | str = 0) -> Answer:  # noqa: A002
-    """Return one query of a finished run with the stored results of the localize stage.
-
-    Args:
-        run: the run folder, `<output_root>/<manifest name>`.
-        scene: the capture's name.
-        map, query: devices of the pair, such as `ios` and `hl`.
-        n: number of the query, name of one of its images (or a unique end of it), or `worst`.
-
-    Raises:
-        ArtifactError: the run, pair or query does not exist (the nearest is named), or files are missing or torn.
-    """
-    files = SceneFiles(Path(run), scene)
-    if not files.poses_dir.is_dir():
-        runs = [path.parent.parent.name for path in Path(run).glob("*/poses/settings.json")]
-        raise ArtifactError(
-            f"{files.poses_dir}: no poses of the scene {scene!r} in the run {run}. {nearest(scene, runs)} "
-            "Localize first: python -m toolkit run MANIFEST."
-        )
-    return InspectedPair(map, query, files.poses_dir, files.features, files.maps).look(n)
-
-
 # One of many queries in a notebook
 
 
