@@ -1,8 +1,9 @@
 """References, matches and results that show themselves, and a query that is tried with something changed."""
 
+import pickle
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,14 @@ def test_a_result_of_no_map_says_so() -> None:
     for ask in (alone.show, alone.show_3d, alone.what_if):
         with pytest.raises(ArtifactError, match=r"Map\.locate"):
             ask()
+
+
+def test_a_result_is_pickled_without_its_map_and_copied_with_it(result: QueryResult) -> None:
+    again = pickle.loads(pickle.dumps(result))
+    assert again.context is None
+    np.testing.assert_array_equal(again.world_from_rig, result.world_from_rig)
+    assert asdict(result)["context"] is result.context
+    assert replace(result, seconds=1.0).context is result.context
 
 
 def test_a_result_keeps_no_pixels_and_no_features(result: QueryResult) -> None:

@@ -199,6 +199,10 @@ class QueryResult:
         """Localize the query again with something changed; see `scene.located.Located.what_if`."""
         return self._in_map.what_if(self, changes or {}, **more)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle the result without its map."""
+        return {**self.__dict__, "context": None}
+
     @property
     def _in_map(self) -> Context:
         if self.context is None:

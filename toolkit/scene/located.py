@@ -1,7 +1,7 @@
 """A query in its map: what references, matches and results need to show themselves, and to be tried with changes."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -53,14 +53,24 @@ class Retrieved(list[References]):
         return list(zip(files, self[image].scores.tolist(), strict=True))
 
 
-@dataclass(frozen=True)
 class Located:
     """A query in its map. What needs the map or features is opened when it is first asked for."""
 
-    answer: Callable[[QueryResult], "Answer"]
-    """Returns how the query was localized, given one of its results."""
-    open: Callable[[], tuple[Map, Query, Sequence[References]]]
-    """Returns map, query and references, to localize again."""
+    def __init__(
+        self,
+        answer: Callable[[QueryResult], "Answer"],
+        open_query: Callable[[], tuple[Map, Query, Sequence[References]]],
+    ) -> None:
+        """
+        Args:
+            answer: returns how the query was localized, given one of its results.
+            open_query: returns map, query and references, to localize again.
+        """
+        self.answer, self.open = answer, open_query
+
+    def __deepcopy__(self, memo: Any) -> "Located":
+        """Return itself: copies of a result share the map."""
+        return self
 
     @cached_property
     def _opened(self) -> tuple[Map, Query, Sequence[References]]:
