@@ -419,7 +419,7 @@ def reconstruct(
         where = ", ".join(
             f"{size} in {folder_of_models / str(number)}" for number, size in enumerate(sizes[1:], start=1)
         )
-        notes.append(f"{len(sizes) - 1} other models do not connect to it: {where}")
+        notes.append(f"not connected to it, so not used: models of {where}")
     points = list(model.points3D.values())
     xyz, rgb = np.array([point.xyz for point in points]), np.array([point.color for point in points], np.uint8)
     notes += placed.notes
