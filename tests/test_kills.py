@@ -93,7 +93,7 @@ def products(run: Path) -> dict[str, object]:
     found: dict[str, object] = {}
     for path in sorted(run.rglob("*")):
         name = path.relative_to(run).as_posix()
-        if path.is_dir() or path.suffix in (".ipynb", ".html") or path.name.endswith((".meta.json", ".lock")):
+        if path.is_dir() or path.suffix in (".ipynb", ".html", ".tex") or path.name.endswith((".meta.json", ".lock")):
             continue
         if name in ("run.json", "run.log") or "/.stages/" in name:
             continue
@@ -105,8 +105,9 @@ def products(run: Path) -> dict[str, object]:
             found[name] = recorded(path)
         elif path.suffix == ".h5":
             found[name] = arrays_of(path)
-        elif path.suffix == ".csv" and path.parent.name == "poses":
-            found[name] = pd.read_csv(path).drop(columns="seconds").to_csv()
+        elif path.suffix == ".csv" and (path.parent.name == "poses" or path.name.startswith("report-")):
+            table = pd.read_csv(path)
+            found[name] = table.drop(columns=[column for column in table if "seconds" in column]).to_csv()
         else:
             found[name] = path.read_bytes()
     return found
