@@ -107,6 +107,7 @@ def test_a_second_one_computes_only_the_model(
     assert len(Capture.open(again)["ios_map"].images) == 6
 
 
+@pytest.mark.slow
 def test_two_places_are_two_models(photographs: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     other.mkdir()

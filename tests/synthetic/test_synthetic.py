@@ -421,6 +421,7 @@ def test_a_short_recording_with_losses_has_a_map_of_few_images(tmp_path: Path) -
     assert not check_capture(capture).problems
 
 
+@pytest.mark.slow
 def test_hard_images_are_added_and_the_easy_ones_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(capture_writing, "build_room", coarse_room)
     first, hard = (
