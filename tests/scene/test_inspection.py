@@ -289,6 +289,8 @@ def test_a_list_chooses_what_is_shown(pair: InspectedPair, monkeypatch: pytest.M
     monkeypatch.setenv(TEXT_BARS, "1")
     outputs.clear()
     choose(pair, pair.names[0])
+    with pytest.raises(ArtifactError, match=r"^inspect: found 99, expected"):
+        choose(pair, 99)
     assert [type(shown).__name__ for shown in outputs] == ["Answer"]
 
 

@@ -226,7 +226,7 @@ def choose(queries: Any, chosen: int | str = 0) -> Choice:
 
     Args:
         queries: `RetrievedPair`, `InspectedPair` or `WorstQueries`: has `names`, and `look`, which takes a number.
-        chosen: number or name of the first query; ignored if it is a number and there are no queries.
+        chosen: number or name of the first query, `inspect` in notebooks; ignored if it is a number without queries.
 
     Raises:
         ArtifactError: the query does not exist.
@@ -236,7 +236,12 @@ def choose(queries: Any, chosen: int | str = 0) -> Choice:
     if not len(queries.names) and isinstance(chosen, int):
         print("There are no queries to show.")
         return Choice(None)
-    choice = Choice(queries.look(chosen))
+    try:
+        choice = Choice(queries.look(chosen))
+    except ArtifactError as error:
+        if not str(error).startswith("query: "):
+            raise
+        raise ArtifactError(f"inspect: {str(error).removeprefix('query: ')}") from None
     if TEXT_BARS in os.environ:
         display(choice.shown)
         return choice
