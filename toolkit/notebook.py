@@ -37,7 +37,6 @@ from toolkit.manifest import (
     nearest,
 )
 from toolkit.manifest.messages import explain
-from toolkit.results.opening import no_such_run
 from toolkit.runs.folder import LOG_VARIABLE, RECORD, counts_text, log_to
 from toolkit.runs.kernel import TEXT_BARS, Kernels, MemoryWatch, kernel_error
 from toolkit.runs.pairs import left_out_of
@@ -129,6 +128,8 @@ def start(
         sessions_root = stages[0]["parameters"].get("sessions_root")
         by_hand = taken_from.with_name(f"{taken_from.name}-by-hand")
     elif taken_from is not None and taken_from != (_root() / DEMO_RUN).resolve():
+        from toolkit.results.opening import no_such_run  # takes half a second, for an error alone
+
         raise no_such_run(taken_from)
     else:
         taken_from = None

@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from functools import cache
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from toolkit.capture.devices import extra_devices, table_record
 from toolkit.capture.names import allow_outside
@@ -68,8 +68,10 @@ from toolkit.runs.cluster import open_cluster
 from toolkit.runs.folder import LOG, OLDER, RECORD, RunLog, counts_text, failures, held, warnings_of_kernels
 from toolkit.runs.kernel import Kernels
 from toolkit.runs.sweep import changed_keys, swept_runs, take_over, variant_name
-from toolkit.scene.run import Run
 from toolkit.sequences.pose_graph import require_gtsam
+
+if TYPE_CHECKING:
+    from toolkit.scene.run import Run
 
 log = logging.getLogger(__name__)
 
@@ -120,13 +122,15 @@ class Job:
         return {**row, **status} if row else None
 
 
-def open_run(folder: str | Path) -> Run:
+def open_run(folder: str | Path) -> "Run":
     """Open a run for a notebook, see `notebook.find_run`; the demo is run first if it has not been yet.
 
     Raises:
         ArtifactError: there is no such run; the message lists runs beside it.
         ManifestError: a parameter of the notebook is wrong.
     """
+    from toolkit.scene.run import Run  # takes most of a second, which `run` does not need
+
     check_given("start")
     path = find_run(folder)
     demo = NOTEBOOKS.parent / "data_manifests" / "demo.yaml"
