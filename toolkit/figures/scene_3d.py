@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.figures.style import GRAY, MAP, new_figure, styled
+from toolkit.figures.style import GRAY, MAP, ORANGE, new_figure, styled
 from toolkit.figures.top_view import places_of
 from toolkit.geometry import Floats, invert, transform, unit
 from toolkit.results.metrics import is_posed
@@ -21,6 +21,12 @@ PYRAMID = np.array([[0, 0, 0], [-0.4, -0.3, 1], [0.4, -0.3, 1], [0.4, 0.3, 1], [
 """Corners (5, 3) of a drawn camera of depth 1: its center, and its image plane."""
 OUTLINE = [0, 1, 2, 0, 3, 4, 0, 1, 4, 3, 2]
 """Order of the corners in which a line draws the pyramid."""
+
+
+def pyramids(poses: Floats, depth: float) -> Floats:
+    """Return cameras (N, 4, 4) as lines (N, 11, 3) of pyramids of a depth."""
+    outline = (depth * PYRAMID)[OUTLINE]
+    return np.asarray(np.einsum("nij,kj->nki", poses[:, :3, :3], outline) + poses[:, None, :3, 3])
 
 
 @dataclass(frozen=True)
@@ -109,16 +115,14 @@ def draw_scene_3d(
     axis.scatter(x, y, s=3.0, c=shades, lw=0, rasterized=True)
 
     def draw(poses: Floats, depth: float, color: str, width: float, label: str | None = None) -> None:
-        corners = (depth * PYRAMID)[OUTLINE]
-        lines = np.einsum("nij,kj->nki", poses[:, :3, :3], corners) + poses[:, None, :3, 3]
-        xy, ahead, _ = flat(lines)
+        xy, ahead, _ = flat(pyramids(poses, depth))
         kept = list(xy[ahead.all(axis=1)])
         axis.add_collection(LineCollection(kept, colors=color, linewidths=width, label=label, zorder=3 + width))
 
     for center, seen in rays:
         ends, ahead, _ = flat(np.stack([np.broadcast_to(center, seen.shape), seen], axis=1))
         lines = list(ends[ahead.all(axis=1)])
-        axis.add_collection(LineCollection(lines, colors="#E69F00", linewidths=0.3, alpha=0.5))
+        axis.add_collection(LineCollection(lines, colors=ORANGE, linewidths=0.3, alpha=0.5))
     draw(map_poses[is_posed(map_poses)], size, MAP, 0.6, "map cameras")
     for pose, label, color in cameras:
         draw(pose[None], 2 * size, color, 1.8, label)

@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import shrunk
-from toolkit.figures.scene_3d import OUTLINE, PYRAMID, Eye
+from toolkit.figures.scene_3d import Eye
 from toolkit.figures.style import GRAY
 from toolkit.files import write_atomic
 from toolkit.geometry import Floats, rotation_to_quaternion
@@ -145,13 +145,6 @@ def log_points(stream: rr.RecordingStream, points: ArrayLike, colors: NDArray[np
 def log_lines(stream: rr.RecordingStream, path: str, lines: Sequence[Floats], color: str) -> None:
     """Log lines, (n, 3) each."""
     stream.log(path, rr.LineStrips3D(lines, colors=rgb(color)), static=True)
-
-
-def pyramids(poses: Floats, depth_m: float) -> NDArray[np.float32]:
-    """Return cameras (N, 4, 4) as lines (N, 11, 3)."""
-    outline = (depth_m * PYRAMID)[OUTLINE]
-    lines = np.einsum("nij,kj->nki", poses[:, :3, :3], outline) + poses[:, None, :3, 3]
-    return lines.astype(np.float32)
 
 
 def hidden_camera() -> rr.Pinhole:

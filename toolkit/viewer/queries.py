@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import prefetch, read_for_display
 from toolkit.capture.world_up import up_of_cameras
+from toolkit.figures.scene_3d import pyramids
 from toolkit.figures.style import ESTIMATED, GREEN, MAP, ORANGE, SKY, TRUE, draw_error_legend, error_colors
 from toolkit.geometry import Floats, local_origin, project, rotation_to_quaternion, shifted
 from toolkit.results.localized import REFERENCES, Localizations, QueryDetails, ShownImage, support_of
@@ -114,7 +115,8 @@ def _layout(name: str, poses: Floats, up: Floats, has_queries: bool) -> Any:
 
 def _log_map_cameras(stream: rr.RecordingStream, poses: Floats, size: float) -> None:
     """Log the map's cameras as small pyramids, all in one entity."""
-    stream.log("world/map_cameras", rr.LineStrips3D(viewer.pyramids(poses, size), colors=viewer.rgb(MAP)), static=True)
+    lines = rr.LineStrips3D(pyramids(poses, size).astype(np.float32), colors=viewer.rgb(MAP))
+    stream.log("world/map_cameras", lines, static=True)
 
 
 def _log_overview(stream: rr.RecordingStream, queries: Localizations, shift: Floats) -> None:
@@ -218,7 +220,7 @@ class _ChosenWriter:
         poses = np.array([pose for pose, _ in query.rivals]).reshape(-1, 4, 4)
         labels = [f"rival, {support:.0%} of the support" for _, support in query.rivals]
         color = viewer.rgb(TRUE)
-        lines = viewer.pyramids(shifted(poses, self._shift) if len(poses) else poses, self._depth_m / 2)
+        lines = pyramids(shifted(poses, self._shift) if len(poses) else poses, self._depth_m / 2).astype(np.float32)
         self._stream.log("world/rivals", rr.LineStrips3D(lines, labels=labels, colors=color, show_labels=False))
         rays = [np.stack([center, point]) + self._shift for point in seen]
         self._stream.log("world/rays", rr.LineStrips3D(rays, colors=viewer.rgb(GREEN), radii=rr.Radius.ui_points(0.5)))
