@@ -28,7 +28,6 @@ from numpy.typing import ArrayLike, NDArray
 from toolkit.capture import names
 from toolkit.capture.cameras import camera_text, parse_camera
 from toolkit.capture.devices import session_id, session_of
-from toolkit.capture.images import thumbnails
 from toolkit.capture.tables import (
     ALIGNED,
     COLUMNS,
@@ -127,6 +126,8 @@ class Session:
         return f"Session({self.id}: {len(self.images)} images, {len(self.sensors)} sensors, {poses} poses)"
 
     def _repr_html_(self) -> str:
+        from toolkit.capture.images import thumbnails  # imports OpenCV
+
         rows = self.camera_rows
         sample = rows[np.unique(np.linspace(0, len(rows) - 1, min(6, len(rows))).astype(int))] if len(rows) else rows
         cameras = [camera_text(self.camera(sensor)) for sensor in pd.unique(self.images["sensor_id"].iloc[rows])]
