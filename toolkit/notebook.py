@@ -231,6 +231,7 @@ def choose_photograph(scene_map: Any) -> None:
     import ipywidgets
 
     from toolkit.localize import localize_image
+    from toolkit.scene.query import guessed_camera, with_focal
 
     chooser = ipywidgets.FileUpload(description="photograph", accept="image/*")
     focal = ipywidgets.FloatText(description="focal [px]", tooltip="0: from EXIF, or estimated")
@@ -243,27 +244,14 @@ def choose_photograph(scene_map: Any) -> None:
             file = Path(folder) / Path(chosen["name"]).name
             file.write_bytes(chosen["content"])
             try:
-                result = localize_image(scene_map, file, _camera_of(file, focal.value))
+                camera = with_focal(guessed_camera(file, [])[0], focal.value) if focal.value > 0 else None
+                result = localize_image(scene_map, file, camera)
                 display(result, result.show(), result.show_3d())
             except errors.ToolkitError as error:
                 print(error)
 
     chooser.observe(localize, "value")
     display(ipywidgets.HBox([chooser, focal]), out)
-
-
-def _camera_of(file: Path, focal_px: float) -> Any:
-    """Return a camera without distortion by its focal length; None for 0."""
-    import pycolmap
-
-    from toolkit.capture.images import stored_size
-
-    if focal_px <= 0:
-        return None
-    width, height = stored_size(file)
-    return pycolmap.Camera(
-        model="SIMPLE_PINHOLE", width=width, height=height, params=[focal_px, width / 2, height / 2]
-    )
 
 
 _STATUSES = ("ok", "low_confidence", "failed")

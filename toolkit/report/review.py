@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import pandas as pd
 
@@ -12,12 +12,11 @@ from toolkit.errors import ArtifactError
 from toolkit.figures.evaluation import wilson_interval
 from toolkit.figures.style import percent
 from toolkit.files import SceneFiles, map_record_path, pair_devices, read_map_record, write_text
-from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings, Settings
+from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings
 from toolkit.pose.result import status_counts
-from toolkit.results.opening import read_settings
+from toolkit.results.opening import AnySettings, read_settings
 from toolkit.results.pair import load_maps, map_files
 
-AnySettings = TypeVar("AnySettings", bound=Settings)
 PAIR = ["map_device", "query_device"]
 COUNTS = ["queries", "ok", "low_confidence", "failed"]
 NAMES = {

@@ -27,7 +27,7 @@ from toolkit.results.metrics import is_posed, worst_first
 from toolkit.results.opening import RETRIEVAL, SESSIONS_ROOT, how_localized
 from toolkit.results.pair import find_query
 from toolkit.runs.kernel import TEXT_BARS
-from toolkit.scene.located import Located
+from toolkit.scene.located import Located, best_ranks
 from toolkit.scene.map import WITHOUT_FEATURES, Map
 from toolkit.scene.stored import StoredQueries
 
@@ -137,12 +137,11 @@ class InspectedPair:
 
     def _retrieved(self, number: int) -> dict[str, tuple[int, float]]:
         images = self.localized.query_session.images.iloc[self.localized.rows[number]]
-        best: dict[str, tuple[int, float]] = {}
-        for key in zip(images["timestamp"].tolist(), images["sensor_id"].astype(str).tolist(), strict=True):
-            for rank, hit in enumerate(self._topk.get(key, []), start=1):
-                name, ranked = image_name(hit["path"]), (rank, float(hit.get("score", np.nan)))
-                best[name] = min(best.get(name, ranked), ranked, key=lambda one: (one[0], -one[1]))
-        return dict(sorted(best.items(), key=lambda item: item[1][0]))
+        keys = zip(images["timestamp"].tolist(), images["sensor_id"].astype(str).tolist(), strict=True)
+        return best_ranks(
+            [(image_name(hit["path"]), float(hit.get("score", np.nan))) for hit in self._topk.get(key, [])]
+            for key in keys
+        )
 
 
 class WorstQueries:
@@ -184,19 +183,23 @@ class WorstQueries:
         Raises:
             ArtifactError: the rank is out of range; or no query has the name, or several do.
         """
-        queries = [(pair, number, pair.localized.rows[number]) for pair, number in self._queries]
-        images, first = dict[str, int](), dict[tuple[str, bytes], int]()
-        for at, (pair, _, rows) in enumerate(queries):
-            session = pair.localized.query_session
-            first.setdefault((session.id, rows.tobytes()), at)
-            images |= {session.image_name(row): first[session.id, rows.tobytes()] for row in rows.tolist()}
         if rank == WORST:
             tables = (pair.localized.results.table for pair, _ in self._queries)
             matched = (table.get("num_matches", table["timestamp"]).iloc[number]
                        for table, (_, number) in zip(tables, self._queries, strict=True))  # fmt: skip
             rank = next((at for at, count in enumerate(matched) if count > 0), 0)
-        pair, number, _ = queries[find_query(rank, images, len(queries))]
+        pair, number = self._queries[find_query(rank, self._worst_of_image, len(self._queries))]
         return pair.look(number)
+
+    @cached_property
+    def _worst_of_image(self) -> dict[str, int]:
+        """Rank of the worst localization of each image, by its name."""
+        worst = dict[str, int]()
+        for rank, (pair, number) in enumerate(self._queries):
+            session = pair.localized.query_session
+            for row in pair.localized.rows[number].tolist():
+                worst.setdefault(session.image_name(row), rank)
+        return worst
 
 
 # One of many queries in a notebook

@@ -1,6 +1,6 @@
 """A query in its map: what references, matches and results need to show themselves, and to be tried with changes."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -161,11 +161,22 @@ class Located:
 
 def ranks(scene_map: Map, references: Sequence[References]) -> dict[str, tuple[int, float]]:
     """Return the best rank, from 1, and the score of each reference by its name, best first."""
+    names = scene_map.localizer.image_names
+    return best_ranks(
+        [(names[image], score) for image, score in zip(found.images.tolist(), found.scores.tolist(), strict=True)]
+        for found in references
+    )
+
+
+def best_ranks(references: Iterable[Iterable[tuple[str, float]]]) -> dict[str, tuple[int, float]]:
+    """Return the best rank, from 1, and the score of each reference by its name, best first.
+
+    Args:
+        references: names and scores of the references of each image of a query, best first.
+    """
     best: dict[str, tuple[int, float]] = {}
-    for retrieved in references:
-        scored = zip(retrieved.images.tolist(), retrieved.scores.tolist(), strict=True)
-        for rank, (image, score) in enumerate(scored, start=1):
-            name = scene_map.localizer.image_names[image]
+    for of_image in references:
+        for rank, (name, score) in enumerate(of_image, start=1):
             best[name] = min(best.get(name, (rank, score)), (rank, score), key=lambda one: (one[0], -one[1]))
     return dict(sorted(best.items(), key=lambda item: item[1][0]))
 
