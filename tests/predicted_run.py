@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.rendered import World, copy_shared, run_stage, write_retrieval
+from tests.rendered import World, copy_shared, prepared, run_stage
 from toolkit.capture import Capture
 from toolkit.files import SceneFiles
 
@@ -18,12 +18,7 @@ def finished(
     """A run that has localized all devices in the phone's map by predictions; do not write to it."""
 
     def make(folder: Path) -> None:
-        files = SceneFiles(folder, small_capture.name)
-        copy_shared(small_features, files.features)
-        capture = Capture.open(small_capture)
-        for device in capture.devices:
-            write_retrieval(files.retrieval("ios", device), capture["ios_map"], capture[f"{device}_query"])
-        run_stage(small_capture, files)
+        run_stage(small_capture, prepared(folder, small_capture, small_features, Capture.open(small_capture).devices))
 
     return SceneFiles(made_once("predicted", make), small_capture.name)
 

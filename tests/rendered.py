@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +62,23 @@ def run_stage(
     options = {"map_device": "ios", "queries": LIST, "workers": 1} | settings | more
     folders = (files.retrieval_dir, files.poses_dir, files.features, files.maps)
     return call(localize_pairs, capture / "sessions", *folders, **options)  # type: ignore[arg-type]
+
+
+def prepared(folder: Path, capture: Path, features: Path, devices: Sequence[str]) -> SceneFiles:
+    """Return the files of a run with features, and with references of these devices' queries in the phone's map."""
+    files, sessions = SceneFiles(folder, capture.name), Capture.open(capture)
+    copy_shared(features, files.features)
+    for device in devices:
+        write_retrieval(files.retrieval("ios", device), sessions["ios_map"], sessions[f"{device}_query"])
+    return files
+
+
+def localized_by_pnp(folder: Path, capture: Path, features: Path, device: str) -> None:
+    """Localize a device in the phone's map, with default settings."""
+    files = prepared(folder, capture, features, [device])
+    folders = (files.retrieval_dir, files.poses_dir, files.features, files.maps)
+    devices = {"map_device": "ios", "query_device": device}
+    localize_pairs(capture / "sessions", *folders, queries=LIST, workers=1, **devices)
 
 
 def write_retrieval(path: Path, mapped: Session, session: Session) -> None:

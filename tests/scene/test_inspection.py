@@ -12,14 +12,13 @@ import pytest
 
 from tests.displayed import picture_of
 from tests.localized import some_correspondences, stored, write_pair
-from tests.rendered import LIST, copy_shared, write_retrieval
+from tests.rendered import localized_by_pnp
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, ManifestError
 from toolkit.figures.answers import Comparison, reason_in_words
 from toolkit.figures.query_images import shown_name
 from toolkit.files import SceneFiles, map_record_path
 from toolkit.geometry import invert
-from toolkit.localize import localize_pairs
 from toolkit.manifest import LocalizeSettings
 from toolkit.pose.result import CAMERA, QueryResult, Rival, Status
 from toolkit.scene.inspection import (
@@ -37,16 +36,8 @@ def files(
 ) -> SceneFiles:
     """A run that has localized the robot's rig in the phone's map by PnP; do not write to it."""
 
-    def make(folder: Path) -> None:
-        files = SceneFiles(folder, small_capture.name)
-        copy_shared(small_features, files.features)
-        capture = Capture.open(small_capture)
-        write_retrieval(files.retrieval("ios", "spot"), capture["ios_map"], capture["spot_query"])
-        folders = files.retrieval_dir, files.poses_dir, files.features, files.maps
-        devices = {"map_device": "ios", "query_device": "spot"}
-        localize_pairs(small_capture / "sessions", *folders, queries=LIST, workers=1, **devices)
-
-    return SceneFiles(made_once("inspected", make), small_capture.name)
+    run = made_once("inspected", lambda folder: localized_by_pnp(folder, small_capture, small_features, "spot"))
+    return SceneFiles(run, small_capture.name)
 
 
 @pytest.fixture(scope="module")

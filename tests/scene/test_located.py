@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 
 from tests.displayed import picture_of
-from tests.rendered import LIST, copy_shared, write_retrieval
-from toolkit.capture import Capture
+from tests.rendered import localized_by_pnp
 from toolkit.errors import ArtifactError
 from toolkit.figures.answers import Answer
 from toolkit.files import SceneFiles
 from toolkit.geometry import transform
-from toolkit.localize import localize_pairs
 from toolkit.pose.base import Query, References
 from toolkit.pose.result import QueryResult, Rival, Status
 from toolkit.runs.kernel import TEXT_BARS
@@ -31,16 +29,8 @@ def files(
 ) -> SceneFiles:
     """A run that has localized the phone in its own map by PnP; do not write to it."""
 
-    def make(folder: Path) -> None:
-        files = SceneFiles(folder, small_capture.name)
-        copy_shared(small_features, files.features)
-        capture = Capture.open(small_capture)
-        write_retrieval(files.retrieval("ios", "ios"), capture["ios_map"], capture["ios_query"])
-        folders = files.retrieval_dir, files.poses_dir, files.features, files.maps
-        localize_pairs(small_capture / "sessions", *folders, queries=LIST, workers=1, map_device="ios",
-                       query_device="ios")  # fmt: skip
-
-    return SceneFiles(made_once("located", make), small_capture.name)
+    run = made_once("located", lambda folder: localized_by_pnp(folder, small_capture, small_features, "ios"))
+    return SceneFiles(run, small_capture.name)
 
 
 @pytest.fixture(scope="module")
