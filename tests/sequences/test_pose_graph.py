@@ -61,6 +61,18 @@ def test_the_stated_covariance_is_as_large_as_the_errors() -> None:
     assert 4.0 < np.mean(chi2) < 8.0  # 6 degrees of freedom
 
 
+@pytest.mark.parametrize("open_by_m", [10.0, 50.0, 1000.0])
+def test_a_pose_that_is_open_in_one_direction_is_solved(open_by_m: float) -> None:
+    """GTSAM found the system singular and ended the run: 50 m beside 0.1 mm is too much for float64."""
+    way = drive(np.random.default_rng(2))
+    covariance = np.diag(np.repeat([1e-4, 1e-2], 3) ** 2)
+    covariance[5, 5] = open_by_m**2
+    queries = replace(way.queries, covariances=np.tile(covariance, (len(way.queries), 1, 1)))
+    placed = place_piece(way.odometry.part(slice(0, 2)), queries.part(slice(0, 2)), SETTINGS)
+    assert np.isfinite(placed.world_from_rig).all()
+    assert set(placed.status) == {FAR}
+
+
 def test_a_pose_is_less_sure_the_farther_it_is_from_a_query() -> None:
     way = drive(np.random.default_rng(2))
     placed = place_piece(way.odometry, way.queries.choose(np.array([0])), SETTINGS)

@@ -213,10 +213,18 @@ def vote_weights(ok: NDArray[np.bool_], p_correct: Floats, rival_support: Floats
     return np.where(ok, weights, weights / (1 + np.nan_to_num(rival_support)))
 
 
-def floored(covariances: Floats) -> Floats:
-    """Return covariances (n, 6, 6) of poses plus the variance of errors of the map, `LEAST_STD_M`, `LEAST_STD_DEG`."""
+def bounded(covariances: Floats) -> Floats:
+    """Return covariances (n, 6, 6) of poses plus the variance of errors of the map, `LEAST_STD_M`, `LEAST_STD_DEG`.
+
+    No direction gets a larger variance than `UNKNOWN_COVARIANCE` has. A pose whose depth is open by 50 m, for example,
+    is known to 0.1 mm in other directions, and the graph's linear system would be singular in float64.
+    """
     least = np.repeat([np.deg2rad(LEAST_STD_DEG), LEAST_STD_M], 3) ** 2
-    return covariances + np.diag(least)
+    most, limited = UNKNOWN_COVARIANCE.max(), covariances.copy()
+    for row in np.flatnonzero(np.trace(covariances, axis1=1, axis2=2) > most):
+        variances, directions = np.linalg.eigh(covariances[row])
+        limited[row] = directions @ np.diag(variances.clip(max=most)) @ directions.T
+    return limited + np.diag(least)
 
 
 @dataclass(frozen=True)
@@ -317,7 +325,7 @@ class _Differences:
         expected = inverse[0][first] @ odometry.odom_from_rig[queries.frames[second]]
         difference = geometry.invert(expected) @ inverse[1][first] @ queries.world_from_rig[second]
         drift = odometry.drift(settings, queries.frames[first], queries.frames[second])
-        covariances = floored(queries.covariances)
+        covariances = bounded(queries.covariances)
         rotation, position = (
             np.trace(covariances[:, part, part], axis1=1, axis2=2) / 3 for part in (slice(3), slice(3, 6))
         )
@@ -364,8 +372,8 @@ def fitted_scale(odometry: Odometry, queries: PosedQueries, settings: SequenceSe
     if len(queries) < 2:
         return 1.0
     moved, placed = odometry.odom_from_rig[queries.frames], queries.world_from_rig
-    rotation = np.trace(floored(queries.covariances)[:, :3, :3], axis1=1, axis2=2) / 3
-    position = np.trace(floored(queries.covariances)[:, 3:, 3:], axis1=1, axis2=2) / 3
+    rotation = np.trace(bounded(queries.covariances)[:, :3, :3], axis1=1, axis2=2) / 3
+    position = np.trace(bounded(queries.covariances)[:, 3:, 3:], axis1=1, axis2=2) / 3
     best = 0.0, 0.0
     lag = 1
     while lag < len(queries):

@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolkit import geometry
-from toolkit.errors import ManifestError
+from toolkit.errors import ArtifactError, ManifestError
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import SequenceSettings
 from toolkit.sequences.odometry import (
     Odometry,
     PosedQueries,
+    bounded,
     cut,
     first_guess,
     fitted_scale,
-    floored,
     place,
     with_measured_drift,
 )
@@ -117,7 +117,7 @@ def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSet
             reason = "another place is as likely"
         status[:] = f"low_confidence: {reason}"
         status[alone.frames], poses[alone.frames] = "ok", alone.world_from_rig
-        covariances[alone.frames] = floored(alone.covariances)
+        covariances[alone.frames] = bounded(alone.covariances)
     status[(status == "ok") & ~is_sure(covariances)] = FAR
     return PlacedPiece(poses, covariances, mask, status, scale)
 
@@ -133,18 +133,26 @@ def _chi2(poses: Floats, covariances: Floats, queries: PosedQueries) -> Floats:
     """Return squared Mahalanobis distances (Q,) of single poses to the graph's, under the sum of their covariances."""
     frames = queries.frames
     difference = geometry.small_motions(geometry.invert(poses[frames]) @ queries.world_from_rig)
-    total = floored(queries.covariances) + covariances[frames]
+    total = bounded(queries.covariances) + covariances[frames]
     return np.asarray(np.einsum("qi,qi->q", difference, np.linalg.solve(total, difference[..., None])[..., 0]))
 
 
 def _optimized(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> tuple[Floats, Floats]:
-    """Solve the pose graph. Return world_from_rig (N, 4, 4) and covariances (N, 6, 6)."""
+    """Solve the pose graph. Return world_from_rig (N, 4, 4) and covariances (N, 6, 6).
+
+    Raises:
+        ArtifactError: the linear system is singular in float64.
+    """
     gtsam = require_gtsam()
     graph, values = _motion_graph(odometry, queries, settings), gtsam.Values()
     for number, pose in enumerate(first_guess(odometry, queries)):
         values.insert(number, gtsam.Pose3(_rigid(pose)))
-    result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    marginals = gtsam.Marginals(graph, result)
+    try:
+        result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+        marginals = gtsam.Marginals(graph, result)
+    except RuntimeError as error:
+        said = str(error).strip().partition("\n")[0]
+        raise ArtifactError(f"The pose graph of {len(odometry)} frames cannot be solved ({said}).") from None
     numbers = range(len(odometry))
     poses = np.stack([result.atPose3(number).matrix() for number in numbers])
     return poses, np.stack([marginals.marginalCovariance(number) for number in numbers])
@@ -165,7 +173,7 @@ def _motion_graph(odometry: Odometry, queries: PosedQueries, settings: SequenceS
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([rotation_std[number], position_std[number]], 3))
         graph.add(gtsam.BetweenFactorPose3(number, number + 1, gtsam.Pose3(_rigid(step)), noise))
     kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(3.0)
-    for frame, pose, covariance in zip(queries.frames.tolist(), queries.world_from_rig, floored(queries.covariances),
+    for frame, pose, covariance in zip(queries.frames.tolist(), queries.world_from_rig, bounded(queries.covariances),
                                        strict=True):  # fmt: skip
         noise = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Gaussian.Covariance(covariance))
         graph.add(gtsam.PriorFactorPose3(frame, gtsam.Pose3(_rigid(pose)), noise))
