@@ -178,4 +178,4 @@ def test_a_notebook_shows_a_figure_as_a_file_has_it_with_what_reaches_beyond_its
     whole, path = figure(), save_figure(figure(), tmp_path / "figure.png")
     np.testing.assert_array_equal(picture_of(whole), Image.open(path))
     with Image.open(path) as picture:
-        assert picture.width > 2 * 110 + 22
+        assert picture.width > 2 * 160 + 32

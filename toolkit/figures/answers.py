@@ -25,8 +25,9 @@ from toolkit.figures.style import (
     VERMILLION,
     new_figure,
     number,
-    shown,
+    picture_of,
     styled,
+    zoomable,
 )
 from toolkit.figures.top_view import Ground, Layer, Places, draw_layers, window_of
 from toolkit.geometry import Floats, shifted
@@ -197,8 +198,8 @@ class Answer:
     def __repr__(self) -> str:
         return f"{self.headline}\n{self.name}\n{self.reason}"
 
-    def _repr_mimebundle_(self, **_: Any) -> dict[str, bytes]:
-        return shown(self.figure)
+    def _repr_html_(self) -> str:
+        return zoomable(picture_of(self.figure), repr(self))
 
 
 @dataclass(frozen=True)
@@ -227,8 +228,8 @@ class Comparison:
     def __repr__(self) -> str:
         return f"{self.changes or 'nothing changed'}\nbefore: {self.before!r}\nafter: {self.after!r}"
 
-    def _repr_mimebundle_(self, **_: Any) -> dict[str, bytes]:
-        return shown(self.figure)
+    def _repr_html_(self) -> str:
+        return zoomable(picture_of(self.figure), repr(self))
 
 
 # In words

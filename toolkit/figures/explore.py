@@ -83,6 +83,21 @@ def list_poses(path: str | Path) -> pd.DataFrame:
     return table.reindex(columns=["image", "status"]).join(pd.DataFrame(rows, columns=POSE_NAMES))
 
 
+def list_unsure(paths: Iterable[str | Path]) -> pd.DataFrame:
+    """Return the queries whose pose is not `ok`: query and map device, image, status with its reason, and inliers.
+
+    Args:
+        paths: poses of each pair, as for `draw_statuses`.
+    """
+    tables = []
+    for results in map(PairResults.open, paths):
+        (mapped, queried), table = results.devices, results.table
+        unsure = table[statuses(table["status"]) != "ok"].reindex(columns=["image", "status", "num_inliers"])
+        tables.append(unsure.assign(pair=f"{queried} in {mapped}"))
+    columns = ["pair", "status", "num_inliers", "image"]
+    return pd.concat(tables, ignore_index=True)[columns] if tables else pd.DataFrame(columns=columns)
+
+
 @styled
 def draw_samples(capture: Capture, count: int = 4) -> "Figure":
     """Draw `count` images of each session, evenly spread over the recording; return the figure."""

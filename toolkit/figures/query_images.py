@@ -13,6 +13,7 @@ from toolkit.capture.images import read_for_display
 from toolkit.figures.style import ESTIMATED, GREEN, SKY, inches_to_pixels, new_figure, styled
 from toolkit.files import own_name
 from toolkit.geometry import Floats, pose_error, project
+from toolkit.pose.base import Query
 from toolkit.results.localized import QueryDetails, ShownImage
 from toolkit.results.metrics import is_posed
 
@@ -175,6 +176,19 @@ def draw_query_and_references(
         draw_image(row[0], image, 2.0, "query", frame="black")
         for rank, (axis, (file, score)) in enumerate(zip(row[1:], found, strict=False), start=1):
             draw_image(axis, file, 2.0, f"{rank}: {score:.3g}")
+    return figure
+
+
+@styled
+def draw_keypoints(query: Query) -> "Figure":
+    """Draw the images of a query with the keypoints of its first kind of features; return the figure."""
+    figure = new_figure(5.0 * len(query.views), 4.0)
+    axes = figure.subplots(1, len(query.views), squeeze=False)[0]
+    for axis, view, features in zip(axes, query.views, query.features, strict=True):
+        keypoints = np.zeros((0, 2)) if isinstance(features, str) else features[0].keypoints
+        image = ShownImage(view.name, view.image, view.camera, np.eye(4))
+        draw_image(axis, image, 4.0, f"{len(keypoints)} keypoints")
+        axis.scatter(*keypoints.T, s=6, facecolors="none", edgecolors=SKY, lw=0.7)
     return figure
 
 

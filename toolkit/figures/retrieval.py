@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -14,7 +14,19 @@ from toolkit.capture import Capture, Session
 from toolkit.embedders import open_descriptors
 from toolkit.errors import ArtifactError
 from toolkit.figures.query_images import draw_image, query_and_references, shown_name
-from toolkit.figures.style import BLUE, GRAY, GREEN, MAP, ORANGE, TRUE, new_figure, shared_legend, shown, styled
+from toolkit.figures.style import (
+    BLUE,
+    GRAY,
+    GREEN,
+    MAP,
+    ORANGE,
+    TRUE,
+    new_figure,
+    picture_of,
+    shared_legend,
+    styled,
+    zoomable,
+)
 from toolkit.figures.top_view import Ground, Layer, draw_layers, window_of
 from toolkit.files import image_name, pair_devices, read_references, require_current
 from toolkit.geometry import Floats, Ints
@@ -69,8 +81,8 @@ class RetrievedQuery:
         good = f", {int((self.references['overlap'] >= MIN_OVERLAP).sum())} overlap" if self.is_known else ""
         return f"query image {self.number}: {self.name}\n{len(self.references)} references{good}"
 
-    def _repr_mimebundle_(self, **_: Any) -> dict[str, bytes]:
-        return shown(self.figure)
+    def _repr_html_(self) -> str:
+        return zoomable(picture_of(self.figure), repr(self))
 
 
 class RetrievedPair:

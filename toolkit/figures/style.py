@@ -1,9 +1,11 @@
 """Common parts of all figures: style, colors, figures without global state, PNG files with a caption, JPEGs."""
 
+import base64
 import io
 import math
 from collections.abc import Callable, Iterable
-from functools import cache, partial, wraps
+from functools import cache, wraps
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 R = TypeVar("R")
 
+SHOWN_DPI, STORED_DPI = 110, 160
+"""Pixels per inch of figures as notebooks show them at first, and as they are stored (`savefig.dpi` of the style)."""
 STYLE = Path(__file__).with_name("figures.mplstyle")
 # Colors of Okabe and Ito, distinguishable with any color vision.
 BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
@@ -50,7 +54,7 @@ def new_figure(width: float, height: float) -> "Figure":
     from matplotlib.figure import Figure  # pyplot has global state, and notebooks would show its figures twice
 
     figure = Figure(figsize=(width, height), layout="constrained")
-    figure._repr_mimebundle_ = partial(shown, figure)  # type: ignore[attr-defined]
+    figure._repr_html_ = lambda: zoomable(picture_of(figure), figure.get_label())  # type: ignore[attr-defined]
     return figure
 
 
@@ -61,8 +65,8 @@ def inches_to_pixels(inches: float) -> int:
     return math.ceil(inches * mpl.rcParams["savefig.dpi"])
 
 
-def shown(figure: "Figure", **_: Any) -> dict[str, bytes]:
-    """Return a figure by MIME type, as notebooks display and store it: as a JPEG if that has less than half its size.
+def picture_of(figure: "Figure") -> bytes:
+    """Return a figure as notebooks display and store it: as a JPEG file if that has less than half the size of PNG.
 
     So photographs become JPEG; lines and text stay PNG, which is sharper and no larger.
     """
@@ -71,7 +75,31 @@ def shown(figure: "Figure", **_: Any) -> dict[str, bytes]:
     png = _png_of(figure)
     with Image.open(io.BytesIO(png)) as picture:
         small = as_jpeg(picture, picture.width)
-    return {"image/jpeg": small} if 2 * len(small) < len(png) else {"image/png": png}
+    return small if 2 * len(small) < len(png) else png
+
+
+def mime_type(picture: bytes) -> str:
+    """Return the MIME type of a PNG or JPEG file."""
+    return "image/png" if picture.startswith(b"\x89PNG") else "image/jpeg"
+
+
+def zoomable(picture: bytes, title: str = "") -> str:
+    """Return HTML of a PNG or JPEG file: as large as its figure, and in full size after a click, without scripts.
+
+    Where a program removes style sheets, as JupyterLab does in notebooks that it does not trust, it stays small.
+    """
+    from PIL import Image
+
+    with Image.open(io.BytesIO(picture)) as opened:
+        width = round(opened.width * SHOWN_DPI / STORED_DPI)
+    data = base64.b64encode(picture).decode()
+    return (
+        "<style>details.zoom[open]{overflow:auto}"
+        "details.zoom[open] img{width:auto!important;max-width:none!important}</style>"
+        "<details class='zoom'><summary style='display:block;cursor:zoom-in' title='Enlarge, or back'>"
+        f"<img src='data:{mime_type(picture)};base64,{data}' alt='{escape(title)}' "
+        f"style='width:{width}px;max-width:100%'></summary></details>"
+    )
 
 
 def as_jpeg(picture: "Image", max_width: int) -> bytes:

@@ -278,6 +278,8 @@ def _settings(manifests: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
     """Return the settings that differ between runs, as texts."""
     columns = {name: pd.json_normalize(dict(manifest)).T.astype(str) for name, manifest in manifests.items()}
     table = pd.concat(columns, axis="columns").droplevel(1, axis="columns").drop(_NAMES, errors="ignore").fillna("–")
+    if len({bool(manifest.get("demo_data")) for manifest in manifests.values()}) > 1:  # a sweep has rendered the demo
+        table = table[~table.index.str.startswith(("captures", "demo_data"))]
     return table[table.nunique(axis="columns") > 1]
 
 
@@ -321,6 +323,7 @@ def draw_differences(comparison: Comparison) -> "Figure":
     lowest, highest = panels[0].get_xlim()
     panels[0].set_xlim(min(lowest, -5), max(highest, 5))  # small differences should look small
     figure.suptitle(f"Recall minus that of {comparison.names[0]}, with intervals of 95 %")
+    figure.set_label("Differences of recall, with intervals")
     if len(others) > 1:
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     return figure
@@ -410,7 +413,9 @@ def _draw_query(comparison: Comparison, query: Mapping[str, Any], run: str) -> "
         if not len(rows):
             raise ArtifactError(f"{files.poses_dir / pair.name}.csv: no row of query {query['timestamp']}.")
         title = f"{run}: {table['status'].iloc[rows[0]]}"
-        return title, draw_localization(pair.details(int(rows[0])), title=title, unit=pair.results.unit)
+        figure = draw_localization(pair.details(int(rows[0])), title=title, unit=pair.results.unit)
+        figure.set_label(f"query {query['timestamp']}, {title}")
+        return title, figure
 
 
 def _name(change: Mapping[str, Any]) -> str:

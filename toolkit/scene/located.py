@@ -41,12 +41,13 @@ class Retrieved(list[References]):
         """Return the names of the references of one image of the query, best first."""
         return [self._map.localizer.image_names[index] for index in self[image].images]
 
-    def _repr_mimebundle_(self, **_: Any) -> dict[str, bytes]:
+    def _repr_html_(self) -> str:
         from toolkit.figures.query_images import draw_query_and_references
-        from toolkit.figures.style import shown
+        from toolkit.figures.style import picture_of, zoomable
 
         of_query = [self._paths(image) for image in range(len(self))]
-        return shown(draw_query_and_references([view.image for view in self._query.views], of_query))
+        figure = draw_query_and_references([view.image for view in self._query.views], of_query)
+        return zoomable(picture_of(figure), "references of the query")
 
     def _paths(self, image: int) -> list[tuple[Any, float]]:
         files = map(self._map.capture.image_path, self.names(image))

@@ -10,7 +10,7 @@ from typing import Any
 from urllib.parse import quote
 
 from toolkit.errors import ArtifactError
-from toolkit.figures.style import as_jpeg
+from toolkit.figures.style import as_jpeg, zoomable
 from toolkit.runs.kernel import TEXT_BARS
 from toolkit.viewer.blueprint import open_command
 
@@ -18,23 +18,21 @@ ASSETS = "RERUN_NOTEBOOK_ASSET"
 """Environment variable that tells rerun_notebook where to load the viewer from; read on import."""
 MAX_INLINE_BYTES = 200_000_000
 """Size of a recording up to which the notebook shows it."""
-MAX_WIDTH = 1400
-"""Width of a JPEG, pixels, at most."""
 
 
 def show_picture(path: str | Path) -> Any:
-    """Return a picture for a notebook: the file as it is, or reduced as a JPEG if that is smaller.
+    """Return a picture file for a notebook, which enlarges it on a click: as it is, or as a JPEG if that is smaller.
 
     Raises:
         ArtifactError: the picture is missing or cannot be read.
     """
     import PIL.Image
-    from IPython.display import Image
+    from IPython.display import HTML
 
     try:
         with PIL.Image.open(path) as picture:
-            small = as_jpeg(picture, MAX_WIDTH)
-        return Image(data=min(Path(path).read_bytes(), small, key=len))
+            small = as_jpeg(picture, picture.width)
+        return HTML(zoomable(min(Path(path).read_bytes(), small, key=len), Path(path).stem))
     except (OSError, SyntaxError, ValueError) as error:
         raise ArtifactError(f"{path}: cannot read the picture ({error}). Run the cells above again.") from None
 

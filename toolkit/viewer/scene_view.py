@@ -16,7 +16,7 @@ from toolkit.capture.world_up import up_of_cameras
 from toolkit.figures.answers import Answer
 from toolkit.figures.query_images import shown_name
 from toolkit.figures.scene_3d import Eye, draw_scene_3d
-from toolkit.figures.style import BLUE, ESTIMATED, TRUE, shown
+from toolkit.figures.style import BLUE, ESTIMATED, TRUE, mime_type, picture_of
 from toolkit.geometry import Floats
 from toolkit.mapping.local_map import LocalMap
 from toolkit.results.localized import Localizations, sure_points
@@ -97,7 +97,8 @@ class View3D:
         return draw_scene_3d(*self._cloud, self._poses, eye, size, cameras, rays, title)
 
     def _repr_mimebundle_(self, **_: Any) -> dict[str, Any]:
-        picture: dict[str, Any] = dict(shown(self.figure))
+        data = picture_of(self.figure)
+        picture: dict[str, Any] = {mime_type(data): data}
         with tempfile.TemporaryDirectory() as folder:
             viewer = open_viewer(lambda: self.save(Path(folder) / "view.rrd"))
         return picture | (viewer._repr_mimebundle_()[0] if viewer is not None else {})
