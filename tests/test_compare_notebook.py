@@ -25,8 +25,8 @@ def test_it_is_committed_clean() -> None:
     assert [cell.id for cell in content.cells] == [f"07-{i:02d}" for i in range(len(content.cells))]
     parameters = content.cells[1].source.splitlines()
     assert [line for line in parameters if "  # " not in line] == ["# Change these first.", "", "# The rest."]
-    assert "notebook.check_given(" in content.cells[2].source
-    assert notebook_parameters(PATH)["runs"] is None
+    assert "pipeline.runs_to_compare(" in content.cells[2].source
+    assert notebook_parameters(PATH)["others"] is None
 
 
 @pytest.mark.slow

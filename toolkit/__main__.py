@@ -552,7 +552,8 @@ def _compare(runs: list[Path], tell: Callable[..., None], as_json: bool, out: Pa
         tell(comparison.text())
     name = f"compare_{'_'.join(comparison.names)}"[:MOST_LETTERS]
     page = (out or runs[0].resolve().parent / f"{name}.html").resolve()
-    parameters = {"runs": [str(run.resolve()) for run in runs], "pictures": pictures, "seed": seed}
+    first, *others = (str(run.resolve()) for run in runs)
+    parameters = {"run": first, "others": others, "pictures": pictures, "seed": seed}
     notebook, _ = execute(notebook_path("compare"), page.with_suffix(".ipynb"), parameters)
     write_page(notebook, page)
     if as_json:

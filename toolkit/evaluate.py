@@ -211,7 +211,8 @@ def evaluate_sequences(
 
     Returns:
         A table with one row per pair and step, see `SequencePair.recalls`; and a table with one row per query that the
-        sequence stage rescued or broke, see `SequencePair.changes`. Both are empty without sequences or ground truth.
+        sequence stage rescued or broke, see `SequencePair.changes`, with its `image`. Both are empty without sequences
+        or ground truth.
     """
     steps, changes = [pd.DataFrame()], [pd.DataFrame()]
     for map_, query in _chosen((map_devices, query_devices), pairs):
@@ -225,7 +226,10 @@ def evaluate_sequences(
             unit, length = metrics.length_unit(read_map_record(map_record_path(poses_dir, capture.name, map_)))
             pair = {"map_device": map_, "query_device": query}
             steps.append(pd.DataFrame(sequence.recalls(keys, truth, limits, unit, length)).assign(**pair))
-            changes.append(sequence.changes(keys, truth, limits[-1], length).assign(**pair))
+            changed = sequence.changes(keys, truth, limits[-1], length).assign(**pair)
+            single = PairResults.of(poses_dir, capture.name, map_, query).table
+            images = single[[*(key := ["timestamp", "device_id"]), "image"]]
+            changes.append(changed.merge(images, "left", on=key))
         except (CaptureError, ArtifactError) as error:
             logger.warning("%s: its sequences are not evaluated. %s", sequence.stem.name, error)
     tables = (pd.concat(parts, ignore_index=True) for parts in (steps, changes))

@@ -12,11 +12,13 @@ import re
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from html import escape
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
+from urllib.parse import quote
 
 import tqdm.auto
 import tqdm.std
@@ -43,7 +45,10 @@ from toolkit.runs.pairs import left_out_of
 
 if TYPE_CHECKING:
     import pandas as pd
+    from pandas.io.formats.style import Styler
     from papermill.exceptions import PapermillExecutionError
+
+    from toolkit.scene.run import Run
 
 log = logging.getLogger(__name__)
 
@@ -65,14 +70,11 @@ UPSTREAM: dict[str, tuple[str, ...]] = {
     "visualize": ("retrieve", "localize", "sequence"),
 }
 
-# nbconvert's page, without the scripts that it loads from other servers, and with `alt` in the metadata of pictures.
+# nbconvert's page, without the scripts that it loads from other servers.
 _PAGE = """{% extends "lab/index.html.j2" %}
 {% block html_head_js %}{% endblock %}
 {% block html_head_js_mathjax %}{% endblock %}
 {% block html_head_js_mermaidjs %}{% endblock %}
-{% set img = "<img alt='%s'" %}
-{% block data_png scoped %}{{ super() | replace("<img", img | format(output.metadata.alt | e)) }}{% endblock %}
-{% block data_jpg scoped %}{{ super() | replace("<img", img | format(output.metadata.alt | e)) }}{% endblock %}
 """
 
 if TEXT_BARS in os.environ:
@@ -83,9 +85,18 @@ if TEXT_BARS in os.environ:
 class Folders(SimpleNamespace):
     """The resolved folders of a notebook, as attributes; displayed as a table. `settings` are those of its stage."""
 
-    def __init__(self, stage: str, **folders: Path) -> None:
+    def __init__(self, stage: str, finished: Path | None = None, **folders: Path) -> None:
         super().__init__(**folders)
-        self._stage = stage
+        self._stage, self._finished = stage, finished
+
+    @property
+    def finished_run(self) -> "Run | None":
+        """The finished run whose results are taken, to take one query in the hand; None while a run is being made."""
+        if self._finished is None:
+            return None
+        from toolkit.scene.run import Run  # takes most of a second, which stages do not need
+
+        return Run.open(self._finished)
 
     @property
     def settings(self) -> Any:
@@ -94,7 +105,7 @@ class Folders(SimpleNamespace):
         return stage_settings(self._stage, _user_names())
 
     def __repr__(self) -> str:
-        folders = {name: path for name, path in vars(self).items() if name != "_stage"}
+        folders = {name: path for name, path in vars(self).items() if not name.startswith("_")}
         return "\n".join(f"{name:<{max(map(len, folders))}}  {path}" for name, path in folders.items())
 
 
@@ -148,7 +159,7 @@ def start(
         resolved[name] = Path(folder).expanduser().resolve() if folder else defaults[name]
         if folder and run_log is None and defaults[name] == files.of_stage(stage):
             _require_outside_of_runs(name, resolved[name])
-    return Folders(stage, **resolved)
+    return Folders(stage, None if run_log else source, **resolved)
 
 
 def find_run(run: str | Path) -> Path:
@@ -213,6 +224,26 @@ def readable(table: "pd.DataFrame", unit: str = "m") -> "pd.DataFrame":
     first = [name for word in ("median", "recall@") for name in shown if name.startswith(word)]
     shown = shown[[*first, *(name for name in shown if name not in first)]]
     return named_by_unit(shown, unit).rename(columns=_short_column)
+
+
+def linked(table: "pd.DataFrame", sessions_root: Path) -> "Styler":
+    """Return a table whose column `image` links to the image files, as a notebook shows it.
+
+    Args:
+        table: image names, `<session>/raw_data/<path>`; those of a rig are joined by `;`.
+        sessions_root: `<capture>/sessions`.
+    """
+
+    def link(names: str) -> str:
+        # Relative to the notebook: JupyterLab opens only what lies below its own folder.
+        files = {name: os.path.relpath(sessions_root.resolve() / name, Path.cwd()) for name in names.split(";")}
+        return " ".join(f"<a href='{quote(file)}' target='_blank'>{escape(name)}</a>" for name, file in files.items())
+
+    table = table.drop(columns=["timestamp", "device_id"], errors="ignore")  # as the image's name tells
+    # A Styler needs unique names of rows.
+    table = table.reset_index(names="pair", drop=table.index.inferred_type != "string")
+    shown = table.style.format({"image": link}).set_properties(**{"text-align": "left"}).hide(axis="index")
+    return shown.format(escape="html", precision=3, subset=[name for name in table.columns if name != "image"])
 
 
 def _short_column(name: str) -> str:
@@ -521,7 +552,7 @@ _TYPES: dict[str, Any] = {
     "inspect": int | str,
     "pairs": Annotated[list[Pair], Field(strict=False)] | None,
     "poses_are": Literal["world_from_cam", "cam_from_world"],
-    "runs": Annotated[list[Folder], Field(strict=False)] | None,
+    "others": Annotated[list[Folder], Field(strict=False)] | None,
     "unit_m": float | None,
 }
 """Types of parameters that are not those of their defaults."""
@@ -599,6 +630,7 @@ def execute(
     # Imported here because that takes seconds, which a run that reuses everything does not need.
     import papermill
     from papermill.exceptions import PapermillExecutionError
+
 
     try:
         notebook = papermill.execute_notebook(

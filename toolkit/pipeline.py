@@ -23,7 +23,7 @@ from toolkit.capture.devices import extra_devices, table_record
 from toolkit.capture.names import allow_outside
 from toolkit.embedders import WEIGHTS as EMBEDDER_WEIGHTS
 from toolkit.embedders import resolve_model
-from toolkit.errors import ManifestError, StageError, ToolkitError, exit_code, sentence
+from toolkit.errors import ArtifactError, ManifestError, StageError, ToolkitError, exit_code, sentence
 from toolkit.exchange.download import is_unfinished
 from toolkit.features.matching import local_weights, resolve_auto
 from toolkit.files import (
@@ -75,6 +75,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+_DEMO, _DEMO_RUN = NOTEBOOKS.parent / "data_manifests" / "demo.yaml", (NOTEBOOKS.parent / DEMO_RUN).resolve()
+
 MOST_WARNINGS = 5
 """Limit of warnings per stage on the terminal; `run.log` has all of them."""
 
@@ -122,8 +124,12 @@ class Job:
         return {**row, **status} if row else None
 
 
-def open_run(folder: str | Path) -> "Run":
+def open_run(folder: str | Path, notebook: str = "start") -> "Run":
     """Open a run for a notebook, see `notebook.find_run`; the demo is run first if it has not been yet.
+
+    Args:
+        folder: the run folder.
+        notebook: name of the notebook, whose parameters are checked.
 
     Raises:
         ArtifactError: there is no such run; the message lists runs beside it.
@@ -131,12 +137,39 @@ def open_run(folder: str | Path) -> "Run":
     """
     from toolkit.scene.run import Run  # takes most of a second, which `run` does not need
 
-    check_given("start")
+    check_given(notebook)
     path = find_run(folder)
-    demo = NOTEBOOKS.parent / "data_manifests" / "demo.yaml"
-    if not (path / RECORD).is_file() and path == (NOTEBOOKS.parent / DEMO_RUN).resolve():
-        run(demo)
+    if not (path / RECORD).is_file() and path == _DEMO_RUN:
+        run(_DEMO)
     return Run.open(path)
+
+
+def runs_to_compare(folder: str | Path, others: Sequence[str | Path] | None = None) -> list[Path]:
+    """Return a run and those to compare it with, for a notebook.
+
+    Args:
+        folder: see `open_run`.
+        others: run folders; None: the runs beside it whose names begin with its name, as a sweep makes them. If the
+            demo has none, it is run with SIFT features alone.
+
+    Raises:
+        ArtifactError: a folder is no run, or there is nothing to compare with.
+    """
+    first = open_run(folder, "compare").path
+    if others is not None:
+        return [first, *map(find_run, others)]
+
+    def beside() -> list[Path]:
+        return sorted(record.parent for record in first.parent.glob(f"{first.name}-*/{RECORD}"))
+
+    if not beside() and first == _DEMO_RUN:
+        _, failed = sweep(_DEMO, ["localize.features=sift"], ["name=demo", "visualize.recordings=false"])
+        for error in failed:
+            raise error
+    if not beside():
+        do = f"Name runs, or make one: python -m toolkit run MANIFEST --sweep key=a,b makes {first.name}-key-a."
+        raise ArtifactError.at("others", f"no run beside {first}", "runs to compare with it", do)
+    return [first, *beside()]
 
 
 def run(
