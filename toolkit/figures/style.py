@@ -54,7 +54,7 @@ def new_figure(width: float, height: float) -> "Figure":
     from matplotlib.figure import Figure  # pyplot has global state, and notebooks would show its figures twice
 
     figure = Figure(figsize=(width, height), layout="constrained")
-    figure._repr_html_ = lambda: zoomable(picture_of(figure), figure.get_label())  # type: ignore[attr-defined]
+    figure._repr_html_ = lambda: zoomable(picture_of(figure), str(figure.get_label()))  # type: ignore[method-assign]
     return figure
 
 
