@@ -166,24 +166,6 @@ def test_a_folder_without_a_model_is_refused(tmp_path: Path) -> None:
         import_colmap(tmp_path, tmp_path, tmp_path / "PLACE")
 
 
-def test_a_model_with_an_empty_file_is_refused(model: Path, tmp_path: Path) -> None:
-    (tmp_path / "binary").mkdir()
-    pycolmap.Reconstruction(str(model)).write_binary(str(tmp_path / "binary"))
-    (tmp_path / "binary" / "points3D.bin").write_bytes(b"")
-    with pytest.raises(CaptureError, match=r"points3D\.bin"):
-        import_colmap(tmp_path / "binary", tmp_path / "photos", tmp_path / "PLACE")
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="needs limits of memory")
-def test_a_model_with_a_count_that_fills_the_memory_is_refused_before_it_does(model: Path, tmp_path: Path) -> None:
-    (tmp_path / "binary").mkdir()
-    pycolmap.Reconstruction(str(model)).write_binary(str(tmp_path / "binary"))
-    (tmp_path / "binary" / "points3D.bin").write_bytes(struct.pack("<Q", 2**40))
-    with pytest.raises(CaptureError, match=r"binary: .*more memory"):
-        import_colmap(tmp_path / "binary", tmp_path / "photos", tmp_path / "PLACE")
-
-
 # ------------------------------------------------------------------------------------------------ folders of images
 
 

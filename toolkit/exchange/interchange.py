@@ -9,8 +9,6 @@ of hloc, `name MODEL width height parameters` per line, is accepted in place of 
 import csv
 import io
 import json
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,6 +23,7 @@ from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.images import exif_camera
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError, ImageError, ManifestError
+from toolkit.exchange.colmap_model import read_model
 from toolkit.exchange.drafts import (
     SUBSESSION,
     DraftImage,
@@ -37,12 +36,10 @@ from toolkit.exchange.drafts import (
 )
 from toolkit.exchange.transforms import import_transforms
 from toolkit.files import file_fingerprint, files_fingerprint, read_json, write_text
-from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
+from toolkit.geometry import Floats, invert, pose_from_qt
 from toolkit.manifest import nearest
 
 POSE_DIRECTIONS = ("world_from_cam", "cam_from_world")
-PROBE_S = 60
-"""Time limit for reading a COLMAP model, seconds, plus 10 s per megabyte; on damaged files COLMAP may never return."""
 _CAMERA_COLUMNS = ("model", "width", "height", "params")
 
 
@@ -57,34 +54,54 @@ def import_colmap(
     out and counted in the report.
 
     Args:
-        model: folder with cameras, images, points3D (and rigs, frames), as .bin or .txt.
+        model: folder with cameras, images (and rigs, frames), as .bin or .txt; or the folder of one such folder.
         images: folder that the model's image names are relative to.
         capture: folder of the capture; created if it does not exist.
         device, split: the session is `<device>_<split>`. Poses of queries become their ground truth.
         placing: `link` to the images, or `copy` them.
 
     Raises:
-        CaptureError: no model in the folder, the session exists already, or no image is left.
+        CaptureError: no model in the folder, or a damaged one; the session exists already, or no image is left.
         ManifestError: an unknown split or placing, or a device that cannot be part of a name.
     """
     draft = start(capture, device, split, Path(images), placing)
-    reconstruction = _read_model(Path(model))
-    rigs = {rig_id: rig for rig_id, rig in sorted(reconstruction.rigs.items()) if rig.num_sensors() > 1}
-    for rig_id, rig in rigs.items():
-        for sensor in sorted(rig.sensor_ids(), key=lambda sensor: sensor.id):
-            is_reference = rig.is_ref_sensor(sensor)
-            sensor_from_rig = None if is_reference else rig.sensor_from_rig(sensor)  # None: not calibrated, no images
-            if sensor.type == pycolmap.SensorType.CAMERA and (is_reference or sensor_from_rig is not None):
-                rig_from_sensor = np.eye(4) if sensor_from_rig is None else _inverse(sensor_from_rig)
-                draft.rigs.append((f"{SUBSESSION}/rig_{rig_id}", f"{SUBSESSION}/cam_{sensor.id}", rig_from_sensor))
-    for _, image in sorted(reconstruction.images.items()):
-        if not image.has_pose:
+    content = read_model(Path(model))
+    draft.notes += content.notes
+    rig_of_image = {
+        image_id: (frame_id, frame)
+        for frame_id, frame in content.frames.items()
+        for image_id in frame.image_ids
+        if frame.rig_id in content.rigs
+    }
+    sensors = _sensors_of_rigs(content.rigs)
+    for rig_id, cameras in sorted(content.rigs.items()):
+        calibrated = {camera_id: pose for camera_id, pose in sorted(cameras.items()) if pose is not None}
+        draft.rigs += [
+            (f"{SUBSESSION}/rig_{rig_id}", sensors[rig_id, camera_id], invert(sensor_from_rig))
+            for camera_id, sensor_from_rig in calibrated.items()
+        ]
+    moved, names = 0, set[str]()
+    for image_id, image in sorted(content.images.items()):
+        frame_id, frame = rig_of_image.get(image_id, (image_id, None))
+        camera, pose = content.cameras.get(image.camera_id, "its camera is not in the model"), image.cam_from_world
+        rig_name, sensor = None, f"{SUBSESSION}/cam_{image.camera_id}"
+        if frame is not None:
+            rig_name, sensor = f"{SUBSESSION}/rig_{frame.rig_id}", sensors[frame.rig_id, image.camera_id]
+            sensor_from_rig = content.rigs[frame.rig_id].get(image.camera_id)
+            pose = frame.rig_from_world if sensor_from_rig is not None else "its camera has no pose in its rig"
+            if not isinstance(pose, str) and not isinstance(image.cam_from_world, str):
+                moved += not np.allclose(sensor_from_rig @ pose, image.cam_from_world, rtol=1e-4, atol=1e-4)
+        unusable = "its name occurs twice in the model" if image.name in names else camera
+        unusable = unusable if isinstance(unusable, str) else pose
+        names.add(image.name)
+        if isinstance(unusable, str) or isinstance(camera, str):
+            draft.rows.append({"image": image.name, "status": unusable})
             continue
-        rig_name = f"{SUBSESSION}/rig_{image.frame.rig_id}" if image.frame.rig_id in rigs else None
-        frame, sensor_name = f"{image.frame_id}", f"{SUBSESSION}/cam_{image.camera_id}"
-        draft.images.append(DraftImage(image.name, image.camera, sensor_name, frame, rig_name))
-        draft.poses[frame] = _inverse(image.frame.rig_from_world if rig_name else image.cam_from_world())
-    not_in_model = set(list_images(draft.folder)) - {image.name for image in draft.images}
+        draft.images.append(DraftImage(image.name, camera, sensor, f"{frame_id}", rig_name))
+        draft.poses[f"{frame_id}"] = invert(unusable)
+    if moved:
+        draft.notes.append(f"{moved} images have another pose than their rig gives them: that of the rig is taken")
+    not_in_model = set(list_images(draft.folder)) - names
     if not_in_model:
         draft.notes.append(f"{len(not_in_model)} images of the folder are not in the model")
     return write_drafts(draft)[0]
@@ -206,43 +223,14 @@ def _is_transforms(table: str | Path | None) -> bool:
     return table is not None and Path(table).suffix == ".json"
 
 
-_PROBE = """
-import os, sys, pycolmap
-size = sum(entry.stat().st_size for entry in os.scandir(sys.argv[1]))
-if sys.platform == "linux":
-    import resource
-    used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 30) + 50 * size,) * 2)
-try:
-    model = pycolmap.Reconstruction(sys.argv[1])
-    [image.cam_from_world() for image in model.images.values() if image.has_pose]
-except MemoryError:
-    sys.exit("a file is damaged: reading it takes more memory than its size justifies")
-except Exception as error:
-    sys.exit(str(error) or type(error).__name__)
-"""
-
-
-def _read_model(folder: Path) -> pycolmap.Reconstruction:
-    """Read a COLMAP model. Try it in a child process first: on damaged files COLMAP may crash or fill the memory."""
-    if not folder.is_dir():
-        raise CaptureError(f"{folder}: no such folder. Expected one with a COLMAP model.")
-    for path in folder.glob("*.bin"):
-        if path.stat().st_size < 8:
-            raise CaptureError(f"{path}: not a file of a COLMAP model: it is cut short. Export the model again.")
-    limit_s = PROBE_S + 1e-5 * sum(path.stat().st_size for path in folder.iterdir())
-    try:
-        probe = subprocess.run(
-            [sys.executable, "-c", _PROBE, str(folder)], capture_output=True, timeout=limit_s, check=False
-        )
-        lines = [line for line in probe.stderr.decode(errors="replace").split("\n") if line.strip(" *")]
-        reason = lines[0].strip()[:300] if lines else f"COLMAP ended with status {probe.returncode}"
-    except subprocess.TimeoutExpired:
-        probe, reason = None, f"COLMAP did not finish in {limit_s:.0f} s"
-    if probe is None or probe.returncode:
-        expected = "Expected cameras, images, points3D as .bin or .txt."
-        raise CaptureError(f"{folder}: cannot be read as a COLMAP model ({reason}). {expected}")
-    return pycolmap.Reconstruction(str(folder))
+def _sensors_of_rigs(rigs: Mapping[int, Mapping[int, Floats | None]]) -> dict[tuple[int, int], str]:
+    """Return the sensor's name by rig and camera: a camera that is in several rigs becomes a sensor of each."""
+    of_camera = Counter(camera_id for cameras in rigs.values() for camera_id in cameras)
+    return {
+        (rig_id, camera_id): f"{SUBSESSION}/cam_{camera_id}" + (f"_rig_{rig_id}" if of_camera[camera_id] > 1 else "")
+        for rig_id, cameras in rigs.items()
+        for camera_id in cameras
+    }
 
 
 # Cameras
@@ -388,9 +376,3 @@ def _read_hloc_list(text: str) -> pd.DataFrame:
     lines = [line.split(maxsplit=4) for line in text.splitlines()]
     rows = [[*line, *[""] * (5 - len(line)), number] for number, line in enumerate(lines, start=1)]
     return pd.DataFrame(rows, columns=["image", *_CAMERA_COLUMNS, "line"])
-
-
-def _inverse(a_from_b: pycolmap.Rigid3d) -> Floats:
-    """Return b_from_a, (4, 4)."""
-    b_from_a = a_from_b.inverse()
-    return make_pose(b_from_a.rotation.matrix(), b_from_a.translation)

@@ -1,0 +1,338 @@
+"""Read cameras, poses and rigs of a COLMAP model, .bin or .txt (https://colmap.github.io/format.html).
+
+COLMAP's own readers end the name of an image at a space, take a pose for points if the line of points is missing, read
+on beyond the end of a file that is cut short, and refuse a whole model for one sensor. Points are not read.
+"""
+
+import codecs
+import mmap
+import re
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from toolkit.capture.cameras import parse_camera
+from toolkit.capture.tables import FARTHEST_M
+from toolkit.errors import CaptureError
+from toolkit.geometry import Floats, pose_from_qt
+
+NORM_TOLERANCE = 0.01
+"""Deviation from 1 of the length of a quaternion that counts as rounding."""
+_CAMERA = 0
+"""Type of the sensors that are cameras, in .bin files."""
+_SUFFIXES = (".bin", ".txt")
+
+
+@dataclass(frozen=True)
+class ModelImage:
+    """An image of a model."""
+
+    name: str
+    camera_id: int
+    cam_from_world: Floats | str
+    """(4, 4), or why there is no pose."""
+
+
+@dataclass(frozen=True)
+class ModelFrame:
+    """What the sensors of a rig measured at one instant."""
+
+    rig_id: int
+    rig_from_world: Floats | str
+    """(4, 4), or why there is no pose."""
+    image_ids: Sequence[int]
+
+
+@dataclass
+class ColmapModel:
+    """The parts of a COLMAP model that make a session, by their ids."""
+
+    cameras: dict[int, pycolmap.Camera | str] = field(default_factory=dict)
+    """Each camera, or why it cannot be used."""
+    images: dict[int, ModelImage] = field(default_factory=dict)
+    rigs: dict[int, dict[int, Floats | None]] = field(default_factory=dict)
+    """sensor_from_rig (4, 4) by camera, of all rigs with several sensors; None for a camera that is not calibrated."""
+    frames: dict[int, ModelFrame] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    """What a user should know of how the files were read."""
+
+
+def read_model(folder: Path) -> ColmapModel:
+    """Read a COLMAP model: cameras and images, and rigs and frames if it has them.
+
+    Raises:
+        CaptureError: there is no model in the folder, or several; or a file is damaged (names file and line or byte).
+    """
+    if not folder.is_dir():
+        raise CaptureError(f"{folder}: no such folder. Expected one with a COLMAP model.")
+    suffixes = _formats(folder)
+    if not suffixes:
+        models = sorted(path for path in folder.iterdir() if path.is_dir() and _formats(path))
+        if len(models) != 1:
+            raise _no_model(folder, models)
+        model = read_model(models[0])
+        model.notes.insert(0, f"the model is in {models[0]}")
+        return model
+    model, suffix = ColmapModel(), suffixes[0]
+    if len(suffixes) > 1:
+        model.notes.append("the model has .bin and .txt files: .bin is read. Move it elsewhere to read .txt")
+    for name in ("cameras", "images", "rigs", "frames"):
+        path = folder / f"{name}{suffix}"
+        if path.is_file():
+            _READERS[suffix, name](path, model)
+    return model
+
+
+def _formats(folder: Path) -> list[str]:
+    """Return the suffixes of the formats in which a folder has cameras and images."""
+    return [suffix for suffix in _SUFFIXES if all((folder / f"{name}{suffix}").is_file() for name in _NEEDED)]
+
+
+_NEEDED = ("cameras", "images")
+
+
+def _no_model(folder: Path, models: Sequence[Path]) -> CaptureError:
+    if models:
+        sizes = []
+        for path in models:
+            with suppress(CaptureError):
+                sizes.append(f"{path.name} ({len(read_model(path).images)} images)")
+        return CaptureError(f"{folder}: found the models {', '.join(sizes)}. Give the folder of one of them.")
+    found = ", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "nothing"
+    expected = "cameras and images, both as .bin or both as .txt"
+    return CaptureError(f"{folder}: found {found}, expected a COLMAP model: {expected}.")
+
+
+# What both formats share
+
+
+def _pose(values: Sequence[float]) -> Floats | str:
+    """Return a pose (4, 4) of qw qx qy qz tx ty tz, or why it is none. The quaternion is normalized."""
+    row = np.array(values)
+    if not (np.abs(row) < FARTHEST_M).all():
+        return f"its pose is not finite: {', '.join(f'{value:g}' for value in values)}"
+    norm = float(np.linalg.norm(row[:4]))
+    if abs(norm - 1) > NORM_TOLERANCE:
+        return f"its quaternion has the length {norm:.4g}, expected 1"
+    return pose_from_qt(np.r_[row[:4] / norm, row[4:]])
+
+
+def _camera(model_name: str, size: Sequence[Any], params: Sequence[Any]) -> pycolmap.Camera | str:
+    try:
+        return parse_camera("camera", ", ".join([model_name, *map(str, size), *map(str, params)]))
+    except ValueError as error:
+        return f"its camera cannot be used: {error}"
+
+
+def _add_rig(model: ColmapModel, rig_id: int, cameras: dict[int, Floats | None], sensors: int) -> None:
+    if sensors > 1:
+        model.rigs[rig_id] = cameras
+
+
+# Text
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Return number and text of the lines of a file that are no comments; empty ones, too."""
+    data = path.read_bytes()
+    marks = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    # Names are those of files, which may have any bytes.
+    text = data.decode("utf-16") if data.startswith(marks) else data.decode("utf-8-sig", "surrogateescape")
+    for number, line in enumerate(re.split(r"\r\n|\n|\r", text), start=1):
+        if not line.startswith("#"):
+            yield number, line.strip()
+
+
+def _malformed(path: Path, number: int, line: str, expected: str) -> CaptureError:
+    return CaptureError(f"{path}, line {number}: found {line[:80]!r}, expected {expected}. Export the model again.")
+
+
+def _text_cameras(path: Path, model: ColmapModel) -> None:
+    for number, line in _lines(path):
+        if words := line.split():
+            if len(words) < 4 or not words[0].isdecimal():
+                raise _malformed(path, number, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]")
+            model.cameras[int(words[0])] = _camera(words[1], words[2:4], words[4:])
+
+
+def _text_images(path: Path, model: ColmapModel) -> None:
+    expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of points"
+    points_follow, without_points = False, 0
+    for number, line in _lines(path):
+        words = line.split(maxsplit=9)
+        is_image = _is_image(words)
+        if points_follow and not is_image:
+            points_follow = False
+        elif is_image:
+            without_points += points_follow
+            try:
+                values, image_id, camera_id = [float(word) for word in words[1:8]], int(words[0]), int(words[8])
+            except ValueError:
+                raise _malformed(path, number, line, expected) from None
+            model.images[image_id] = ModelImage(words[9], camera_id, _pose(values))
+            points_follow = True
+        elif line:
+            raise _malformed(path, number, line, expected)
+    if without_points:
+        model.notes.append(f"{path.name}: {without_points} images have no line of points, which is not needed")
+    stated = re.search(rb"# *Number of images: *(\d+)", path.read_bytes()[:2000])
+    if stated and int(stated[1]) != len(model.images):
+        model.notes.append(f"{path.name}: {len(model.images)} images, its header says {int(stated[1])}")
+
+
+def _is_image(words: Sequence[str]) -> bool:
+    """Tell whether a line, split at its first nine spaces, is about an image rather than about points.
+
+    Lines of points are numbers, three for each. A name may have spaces, and may be a number if it has none.
+    """
+    if len(words) < 10 or not words[0].isdecimal() or not words[8].isdecimal():
+        return False
+    name = words[9].split()
+    return len(name) == 1 or not (_is_number(name[0]) and _is_number(name[-1]))
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _text_rigs(path: Path, model: ColmapModel) -> None:
+    expected = "RIG_ID NUM_SENSORS REF_SENSOR_TYPE REF_SENSOR_ID, then TYPE ID HAS_POSE [QW QX QY QZ TX TY TZ]"
+    for number, line in _lines(path):
+        words = iter(line.split())
+        if not line:
+            continue
+        try:
+            rig_id, count, cameras = int(next(words)), int(next(words)), dict[int, Floats | None]()
+            for sensor in range(count):
+                kind, sensor_id = next(words), int(next(words))
+                pose: Floats | str | None = np.eye(4)
+                if sensor:
+                    pose = _pose([float(next(words)) for _ in range(7)]) if int(next(words)) else None
+                if kind == "CAMERA":
+                    cameras[sensor_id] = None if isinstance(pose, str) else pose
+        except (ValueError, StopIteration, RuntimeError):
+            raise _malformed(path, number, line, expected) from None
+        if next(words, None) is not None:
+            raise _malformed(path, number, line, expected)
+        _add_rig(model, rig_id, cameras, count)
+
+
+def _text_frames(path: Path, model: ColmapModel) -> None:
+    expected = "FRAME_ID RIG_ID QW QX QY QZ TX TY TZ NUM_DATA_IDS, then TYPE SENSOR_ID DATA_ID"
+    for number, line in _lines(path):
+        words = line.split()
+        if not line:
+            continue
+        try:
+            frame_id, rig_id, count = int(words[0]), int(words[1]), int(words[9])
+            pose, data = _pose([float(word) for word in words[2:9]]), words[10:]
+            if len(data) != 3 * count:
+                raise ValueError
+            images = [int(data[k + 2]) for k in range(0, len(data), 3) if data[k] == "CAMERA"]
+        except (ValueError, IndexError):
+            raise _malformed(path, number, line, expected) from None
+        model.frames[frame_id] = ModelFrame(rig_id, pose, images)
+
+
+# Binary
+
+
+class _Binary:
+    """A binary file, read from its start; every read is checked against its size."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.at = path, 0
+        with path.open("rb") as file:
+            # Points fill most of the file and are skipped, so it is not read into memory.
+            self.data: Any = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if path.stat().st_size else b""
+
+    def read(self, form: str) -> tuple[Any, ...]:
+        """Return values by `struct`'s format, little-endian without gaps."""
+        self.skip(size := struct.calcsize("<" + form))
+        return struct.unpack_from("<" + form, self.data, self.at - size)
+
+    def skip(self, size: int) -> None:
+        if self.at + size > len(self.data):
+            raise CaptureError(f"{self.path}: cut short: found {len(self.data)} bytes. Export the model again.")
+        self.at += size
+
+    def name(self) -> str:
+        end = self.data.find(b"\0", self.at)
+        name = self.data[self.at : end]
+        self.skip(end - self.at + 1 if end >= 0 else len(self.data))
+        return bytes(name).decode("utf-8", "surrogateescape")
+
+    def __iter__(self) -> Iterator[int]:
+        """Count the records; the file must end with the last."""
+        (count,) = self.read("Q")
+        yield from range(count)
+        if self.at != len(self.data):
+            found = f"{len(self.data)} bytes, expected {self.at} for {count} records"
+            raise CaptureError(f"{self.path}: damaged: found {found}. Export the model again.")
+
+
+def _binary_cameras(path: Path, model: ColmapModel) -> None:
+    file = _Binary(path)
+    known = {int(kind): name for name, kind in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
+    for _ in file:
+        camera_id, kind, *size = file.read("IiQQ")
+        if kind not in known:
+            found = f"camera {camera_id} of the unknown model number {kind}"
+            raise CaptureError(f"{path}: found {found}, expected one of {', '.join(known.values())}.")
+        count = len(pycolmap.Camera.create_from_model_name(0, known[kind], 1.0, 1, 1).params)
+        model.cameras[camera_id] = _camera(known[kind], size, file.read(f"{count}d"))
+
+
+def _binary_images(path: Path, model: ColmapModel) -> None:
+    file = _Binary(path)
+    for _ in file:
+        image_id, *values, camera_id = file.read("I7dI")
+        model.images[image_id] = ModelImage(file.name(), camera_id, _pose(values))
+        (points,) = file.read("Q")
+        file.skip(24 * points)
+
+
+def _binary_rigs(path: Path, model: ColmapModel) -> None:
+    file = _Binary(path)
+    for _ in file:
+        rig_id, count = file.read("II")
+        cameras = dict[int, Floats | None]()
+        for sensor in range(count):
+            kind, sensor_id = file.read("iI")
+            pose: Floats | str | None = np.eye(4)
+            if sensor:
+                pose = _pose(file.read("7d")) if file.read("B")[0] else None
+            if kind == _CAMERA:
+                cameras[sensor_id] = None if isinstance(pose, str) else pose
+        _add_rig(model, rig_id, cameras, count)
+
+
+def _binary_frames(path: Path, model: ColmapModel) -> None:
+    file = _Binary(path)
+    for _ in file:
+        frame_id, rig_id, *values, count = file.read("II7dI")
+        data = [file.read("iIQ") for _ in range(count)]
+        images = [image_id for kind, _, image_id in data if kind == _CAMERA]
+        model.frames[frame_id] = ModelFrame(rig_id, _pose(values), images)
+
+
+_READERS: dict[tuple[str, str], Callable[[Path, ColmapModel], None]] = {
+    (".txt", "cameras"): _text_cameras,
+    (".txt", "images"): _text_images,
+    (".txt", "rigs"): _text_rigs,
+    (".txt", "frames"): _text_frames,
+    (".bin", "cameras"): _binary_cameras,
+    (".bin", "images"): _binary_images,
+    (".bin", "rigs"): _binary_rigs,
+    (".bin", "frames"): _binary_frames,
+}
