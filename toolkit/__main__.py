@@ -53,13 +53,14 @@ TextFile = Annotated[Path, Argument(help="Text file.")]
 _AXES = "Camera axes of the poses. opencv: x right, y down, z forward; opengl: x right, y up, z backward."
 Axes = Annotated[str, Option("--axes", metavar="opencv|opengl", help=_AXES)]
 _NAMES = "Name imported images as in your folder (own), or as in the capture (capture)."
-Names = Annotated[str, Option("--names", metavar="own|capture", help=_NAMES)]
+Names = Annotated[str, Option("--names", metavar="own|capture|file", help=_NAMES)]
 Settings = Annotated[
     list[str] | None, Option("--set", metavar="KEY=VALUE", help="Replace a setting; `run`: in a new run.")
 ]
 Capture = Annotated[Path | None, Option(help="Capture folder, if it has moved since the run.")]
 Json = Annotated[bool, Option("--json", help="Print only a summary as JSON to stdout, everything else to stderr.")]
 _CLUSTER = "Dask workers: N on this machine, of a scheduler, or started by a cluster's queue (see docs/scaling.md)."
+_KINDS = "7scenes, 12scenes, cambridge, aachen, eth3d, tum, kitti or euroc."
 _SWEEP = "Run once per value, each in its own folder, and compare. Repeat it to run all combinations."
 _FAILED = (
     "What to write for a query without a pose. `nearest`, the default: the pose of its best retrieved reference, as "
@@ -358,6 +359,27 @@ def import_transforms(
 
     for report in import_transforms(transforms, capture, device, split, placing, axes, unit, hold_out):
         print(report.text())
+
+
+@import_app.command("dataset")
+def import_dataset(
+    kind: Annotated[str, Argument(metavar="KIND", help=_KINDS)],
+    path: Annotated[Path, Argument(help="Folder of the data set as published, or of one of its scenes.")],
+    capture: Annotated[Path, Argument(help="New capture folder, with a map and a query session.")],
+    scene: Annotated[str | None, Option(help="Scene below PATH, e.g. chess.")] = None,
+    device: Device = "ios",
+    every: Annotated[int, Option(min=1, metavar="N", help="Take every Nth image of each folder.")] = 1,
+    hold_out: Annotated[int, Option(min=2, metavar="N", help="Every Nth image is a query, without a split.")] = 8,
+    placing: Placing = "link",
+) -> None:
+    """Make a map and queries from a data set of the field, and a manifest with its thresholds."""
+    from toolkit.exchange.datasets import LAYOUTS, import_dataset
+    from toolkit.exchange.new_manifest import new_manifest
+
+    for report in import_dataset(kind, path, capture, scene, device, every, hold_out, placing):
+        print(report.text())
+    name = re.sub(r"[^A-Za-z0-9._-]", "-", capture.resolve().name)
+    print(f"Run it: python -m toolkit run {new_manifest(name, capture, thresholds=LAYOUTS[kind].thresholds)}")
 
 
 @app.command()

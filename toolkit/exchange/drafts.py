@@ -94,12 +94,19 @@ class Draft:
     unit: str | None = "m"  # unit of the poses; None: unknown
     notes: list[str] = field(default_factory=list)
     sources: dict[str, Path] = field(default_factory=dict)  # files that are not in `folder` under their names
+    given_times: int = 0  # images whose time is not from EXIF
     sensors: dict[str, str] = field(default_factory=dict)  # id by `camera_text`, for images that are not in a rig
 
-    def add(self, name: str, camera: pycolmap.Camera, world_from_cam: Floats | None) -> None:
-        """Add an image that is not in a rig. Images with equal intrinsics share a camera."""
+    def add(
+        self, name: str, camera: pycolmap.Camera, world_from_cam: Floats | None, time_us: int | None = None
+    ) -> None:
+        """Add an image that is not in a rig. Images with equal intrinsics share a camera.
+
+        Args:
+            time_us: when it was taken, microseconds; None: from EXIF.
+        """
         sensor = self.sensors.setdefault(camera_text(camera), f"{SUBSESSION}/cam_{len(self.sensors) + 1}")
-        self.images.append(DraftImage(name, camera, sensor, name))
+        self.images.append(DraftImage(name, camera, sensor, name, time_us=time_us))
         if world_from_cam is not None:
             self.poses[name] = world_from_cam
 
@@ -179,7 +186,9 @@ class Draft:
         except ImageError as error:
             return str(error)
         orientation, camera = read_number(exif, ORIENTATION), image.camera
-        image.turned, image.time_us = orientation > 1, time_taken(exif)
+        image.turned = orientation > 1
+        self.given_times += image.time_us is not None
+        image.time_us = time_taken(exif) if image.time_us is None else image.time_us
         (width, height), sides = size, (*size, camera.width, camera.height)
         if size == (camera.width, camera.height):
             return ""
@@ -196,7 +205,7 @@ class Draft:
         frames = list(dict.fromkeys(image.frame for image in self.images))
         taken = {image.frame: image.time_us for image in reversed(self.images) if image.time_us is not None}
         if len(taken) == len(frames) == len(set(taken.values())):
-            self.notes.append("timestamps: camera clock, from EXIF")
+            self.notes.append(f"timestamps: {'as given' if self.given_times else 'camera clock, from EXIF'}")
             return taken
         why = f"some images have {'no' if len(taken) < len(frames) else 'the same'} time in EXIF"
         self.notes.append(f"timestamps: made up, one second apart in the order of the images ({why})")
