@@ -45,6 +45,8 @@ USAGE, INTERRUPTED = 2, 130
 
 Device = Annotated[str, Option(help="Device type: ios, hl, spot or another name.")]
 Placing = Annotated[str, Option("--images", metavar="link|copy", help="Link to the images, or copy them.")]
+_MASKS = "Folder of masks, black where to use no features: 1.jpg.png of 1.jpg. Default: `masks` beside or in IMAGES."
+Masks = Annotated[Path | None, Option(help=_MASKS)]
 Run = Annotated[Path, Argument(help="Run folder.")]
 Scene = Annotated[str, Argument(help="Name of the capture.")]
 MapDevice = Annotated[str, Argument(help="Map device.")]
@@ -308,11 +310,12 @@ def import_colmap(
     device: Device = "ios",
     split: Annotated[str, Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
     placing: Placing = "link",
+    masks: Masks = None,
 ) -> None:
     """Make a session from a COLMAP model: cameras, poses, rigs."""
     from toolkit.exchange import interchange
 
-    print(interchange.import_colmap(model, images, capture, device, split, placing).text())
+    print(interchange.import_colmap(model, images, capture, device, split, placing, masks).text())
 
 
 @import_app.command("images")
@@ -333,12 +336,13 @@ def import_images(
     ] = None,
     cameras: Annotated[Path | None, Option(help="COLMAP's cameras.txt.")] = None,
     placing: Placing = "link",
+    masks: Masks = None,
 ) -> None:
     """Make a session from a folder of images: a map with poses, or queries."""
     from toolkit.exchange import interchange
 
     report = interchange.import_images(
-        images, capture, device, split, table, poses_are, camera, cameras, placing, axes, unit, truth
+        images, capture, device, split, table, poses_are, camera, cameras, placing, axes, unit, truth, masks
     )
     print(report.text())
 
@@ -353,11 +357,12 @@ def import_transforms(
     unit: Annotated[float | None, Option(metavar="METERS", help="Meters per unit of the poses if known.")] = None,
     axes: Axes = "opengl",
     placing: Placing = "link",
+    masks: Masks = None,
 ) -> None:
     """Make a session from a transforms.json: cameras with distortion, poses."""
     from toolkit.exchange.transforms import import_transforms
 
-    for report in import_transforms(transforms, capture, device, split, placing, axes, unit, hold_out):
+    for report in import_transforms(transforms, capture, device, split, placing, axes, unit, hold_out, masks):
         print(report.text())
 
 
@@ -397,6 +402,7 @@ def reconstruct(
     positions: Annotated[Path | None, Option(help="CSV: image,x,y,z, known camera centers in meters.")] = None,
     mapper: Annotated[str, Option(metavar="incremental|global", help="COLMAP's mapper.")] = "incremental",
     placing: Placing = "link",
+    masks: Masks = None,
 ) -> None:
     """Make a map from photographs or videos without poses, by structure from motion."""
     from toolkit import pipeline
@@ -411,7 +417,9 @@ def reconstruct(
     manifest = Path("data_manifests") / f"{re.sub(r'[^A-Za-z0-9._-]', '-', capture.resolve().name)}.yaml"
     if manifest.exists() and str(capture) not in manifest.read_text(encoding="utf-8"):
         raise ManifestError(f"{manifest} is about another capture. Rename it, or give {capture} another name.")
-    result = reconstruct(photos, capture, device, hold_out, fps, camera, distance, positions, mapper, placing)
+    result = reconstruct(
+        photos, capture, device, hold_out, fps, camera, distance, positions, mapper, placing, masks
+    )
     print(result.text())
     picture = capture / FOLDER / "cameras.png"
     draw_top_view(Capture.open(capture), points=result.points, colors=result.colors).savefig(picture)

@@ -22,10 +22,18 @@ from toolkit.capture import RAW_DATA, Trajectory, write_session
 from toolkit.capture.cameras import camera_text
 from toolkit.capture.devices import SPLITS
 from toolkit.capture.folder import IMPORT_RECORD
-from toolkit.capture.images import NO_FILE, ORIENTATION, read_header, read_number, time_taken
+from toolkit.capture.images import (
+    NO_FILE,
+    ORIENTATION,
+    find_mask,
+    read_header,
+    read_number,
+    stored_size,
+    time_taken,
+)
 from toolkit.capture.names import EXPECTED_NAME, is_bad_name, note_linked_here
 from toolkit.errors import CaptureError, ImageError, ManifestError
-from toolkit.files import IMPORTED, write_folder
+from toolkit.files import IMPORTED, MASKS, write_folder
 from toolkit.geometry import Floats, make_pose
 from toolkit.manifest import nearest
 
@@ -95,6 +103,8 @@ class Draft:
     notes: list[str] = field(default_factory=list)
     sources: dict[str, Path] = field(default_factory=dict)  # files that are not in `folder` under their names
     given_times: int = 0  # images whose time is not from EXIF
+    masks: Path | None = None  # folder of masks as COLMAP names them; None: see `images.find_mask`
+    mask_files: dict[str, Path] = field(default_factory=dict)  # those that are not in `masks` under their names
     sensors: dict[str, str] = field(default_factory=dict)  # id by `camera_text`, for images that are not in a rig
 
     def add(
@@ -114,6 +124,29 @@ class Draft:
         """Return the file of an image."""
         return self.sources.get(name, self.folder / name)
 
+    def _find_masks(self) -> dict[str, Path]:
+        """Return the masks of the images by name, and note how many images have one.
+
+        Raises:
+            CaptureError: the user gave a folder of masks, but no image has one there.
+        """
+        found = {image.name: self.mask_files.get(image.name) or find_mask(self.source(image.name), self.masks)
+                 for image in self.images}  # fmt: skip
+        masks = {name: path for name, path in found.items() if path is not None}
+        first = self.images[0].name
+        if self.masks is not None and not masks:
+            raise CaptureError(f"{self.masks}: no mask of {self.folder}. Expected that of {first} as {first}.png.")
+        if masks:
+            self.notes.append(f"masks of {len(masks)} of {len(found)} images; no features where they are black")
+        for image in self.images:
+            size = stored_size(masks[image.name]) if image.name in masks else (image.camera.width, image.camera.height)
+            if size != (image.camera.width, image.camera.height):
+                self.notes.append(
+                    f"{masks[image.name]}: {size[0]} x {size[1]} pixels, expected {image.camera.width} x "
+                    f"{image.camera.height}, as {image.name}, which has no features until you correct its mask"
+                )
+        return masks
+
     def leave_out(self) -> None:
         """Leave out the images that cannot be used; raise CaptureError if none is left."""
         problems = {image.name: self._problem(image) for image in self.images}
@@ -129,15 +162,16 @@ class Draft:
         """Write the session; call `leave_out` before."""
         if turned := sum(image.turned for image in self.images):
             self.notes.append(f"{turned} images have an EXIF orientation, which is ignored: pixels are used as stored")
-        times = self._choose_times()
+        times, masks = self._choose_times(), self._find_masks()
         columns = ["image", "status", "path", "timestamp", "sensor_id", "device_id", "camera"]
         for image in self.images:
             values = image.path, times[image.frame], image.sensor, image.device, camera_text(image.camera)
             self.rows.append(dict(zip(columns, (image.name, "imported", *values), strict=True)))
         table = pd.DataFrame(self.rows, columns=columns).astype({"timestamp": "Int64"})
         with write_folder(self.session) as session:
-            for image in self.images:
-                source, target = self.source(image.name), session / RAW_DATA / image.path
+            files = [(self.source(image.name), session / RAW_DATA / image.path) for image in self.images]
+            files += [(path, session / MASKS / f"{IMPORTED}{name}.png") for name, path in masks.items()]
+            for source, target in files:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 if self.placing == "copy":
                     shutil.copyfile(source, target)
@@ -212,7 +246,9 @@ class Draft:
         return {frame: (number + 1) * 10**6 for number, frame in enumerate(frames)}
 
 
-def start(capture: str | Path, device: str, split: str, folder: Path, placing: str) -> Draft:
+def start(
+    capture: str | Path, device: str, split: str, folder: Path, placing: str, masks: str | Path | None = None
+) -> Draft:
     """Return the draft of a new session. Raise CaptureError if it exists, ManifestError for an invalid argument."""
     if split not in SPLITS:
         raise ManifestError(f"split: unknown {split!r}. {nearest(split, SPLITS)}")
@@ -223,7 +259,7 @@ def start(capture: str | Path, device: str, split: str, folder: Path, placing: s
     session = Path(capture) / "sessions" / f"{device}_{split}"
     if session.exists():
         raise CaptureError(f"{session} exists already. Import into another capture or device, or remove it first.")
-    return Draft(session, folder, placing)
+    return Draft(session, folder, placing, masks=None if masks is None else Path(masks))
 
 
 def write_drafts(*drafts: Draft) -> list[ImportReport]:
@@ -238,7 +274,9 @@ def write_drafts(*drafts: Draft) -> list[ImportReport]:
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[str]:
-    """Return the images in and below a folder, sorted by path. Links to folders elsewhere are followed, each once.
+    """Return the images in and below a folder, sorted by path, without masks (see `images.find_mask`).
+
+    Links to folders elsewhere are followed, each once.
 
     Raises:
         CaptureError: there is no image.
@@ -252,10 +290,15 @@ def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> lis
             else:
                 visited.append(target)
         names += [Path(root, name).relative_to(folder).as_posix() for name in files]
-    names = sorted((name for name in names if name.lower().endswith(suffixes)), key=Path)
+    names = sorted((name for name in names if name.lower().endswith(suffixes) and not _is_mask(name)), key=Path)
     if not names:
         raise CaptureError(f"{folder}: no image in or below it. Expected {', '.join(suffixes)}.")
     return names
+
+
+def _is_mask(name: str) -> bool:
+    path = PurePosixPath(name)
+    return MASKS in path.parts[:-1] and path.suffix == ".png" and path.stem.lower().endswith(IMAGE_SUFFIXES)
 
 
 def posed_camera(world_from_named: Floats, axes: str, unit_m: float) -> Floats:

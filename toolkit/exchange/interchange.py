@@ -45,7 +45,7 @@ _CAMERA_COLUMNS = ("model", "width", "height", "params")
 
 def import_colmap(
     model: str | Path, images: str | Path, capture: str | Path, device: str = "ios", split: str = "map",
-    placing: str = "link",
+    placing: str = "link", masks: str | Path | None = None,
 ) -> ImportReport:  # fmt: skip
     """Make a session from a COLMAP model and its images: cameras, poses, and the rigs that have several cameras.
 
@@ -59,12 +59,13 @@ def import_colmap(
         capture: folder of the capture; created if it does not exist.
         device, split: the session is `<device>_<split>`. Poses of queries become their ground truth.
         placing: `link` to the images, or `copy` them.
+        masks: folder of masks, see `images.find_mask`; they are placed as the images are.
 
     Raises:
         CaptureError: no model in the folder, or a damaged one; the session exists already, or no image is left.
         ManifestError: an unknown split or placing, or a device that cannot be part of a name.
     """
-    draft = start(capture, device, split, Path(images), placing)
+    draft = start(capture, device, split, Path(images), placing, masks)
     content = read_model(Path(model))
     draft.notes += content.notes
     rig_of_image = {
@@ -111,6 +112,7 @@ def import_images(
     images: str | Path, capture: str | Path, device: str = "ios", split: str = "query", table: str | Path | None = None,
     poses_are: str = "world_from_cam", camera: str | None = None, cameras: str | Path | None = None,
     placing: str = "link", axes: str = "opencv", unit_m: float = 1.0, truth: str | Path | None = None,
+    masks: str | Path | None = None,
 ) -> ImportReport:  # fmt: skip
     """Make a session from a folder of images without rigs.
 
@@ -119,7 +121,7 @@ def import_images(
 
     Args:
         images: folder; without a table, all JPEG and PNG files in and below it are imported.
-        capture, device, split, placing: as for `import_colmap`. A map needs poses.
+        capture, device, split, placing, masks: as for `import_colmap`. A map needs poses.
         table: CSV file, see the module's docstring.
         poses_are: direction of the poses in table and truth, `world_from_cam` or `cam_from_world`.
         camera: intrinsics of all images, `MODEL, width, height, parameter, ...`, with COLMAP's models.
@@ -139,7 +141,7 @@ def import_images(
     if poses_are not in POSE_DIRECTIONS:
         raise ManifestError(f"poses_are: unknown {poses_are!r}. {nearest(poses_are, POSE_DIRECTIONS)}")
     require_convention(axes, unit_m)
-    draft, folder = start(capture, device, split, Path(images), placing), Path(images)
+    draft, folder = start(capture, device, split, Path(images), placing, masks), Path(images)
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder of images.")
     rows = _read_table(Path(table)) if table is not None else pd.DataFrame({"image": list_images(folder), "line": 0})

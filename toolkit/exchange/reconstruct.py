@@ -114,6 +114,7 @@ class _Work:
             draft.images.append(
                 DraftImage(item.name, self.cameras[number], f"{SUBSESSION}/cam_{number + 1}", item.name)
             )
+        draft.mask_files = {item.name: item.mask for item in photographs if item.mask is not None}
         draft.leave_out()
         self.unusable = {row["image"]: row["status"] for row in draft.rows}
         draft.write()
@@ -323,6 +324,7 @@ def reconstruct(
     sources: Sequence[str | Path], capture: str | Path, device: str = "ios", hold_out: int = 0,
     fps: float | None = None, camera: str | None = None, distance: tuple[str, str, float] | None = None,
     positions: str | Path | None = None, mapper: str = "incremental", placing: str = "link",
+    masks: str | Path | None = None,
 ) -> Reconstruction:  # fmt: skip
     """Make a map session from photographs without poses, and with `hold_out` a query session with ground truth.
 
@@ -339,6 +341,7 @@ def reconstruct(
         positions: CSV file with the columns image, x, y, z: known camera centers, meters.
         mapper: COLMAP's `incremental` or `global` mapper.
         placing: `link` to the photographs, or `copy` them.
+        masks: folder of masks, see `images.find_mask`.
 
     Raises:
         CaptureError: no photograph, no two that fit together, a session that exists, or a malformed file.
@@ -351,7 +354,7 @@ def reconstruct(
     folder = Path(capture) / FOLDER
     splits = ("map", "query") if hold_out else ("map",)
     drafts = [start(capture, device, split, folder, placing) for split in splits]
-    photographs, unreadable = gather(list(map(Path, sources)), folder / "images", fps)
+    photographs, unreadable = gather(list(map(Path, sources)), folder / "images", fps, masks and Path(masks))
     known = read_positions(Path(positions)) if positions is not None else None
     given = None
     if camera is not None:
@@ -397,6 +400,8 @@ def reconstruct(
             pose = image.cam_from_world().inverse()
             draft.poses[item.name] = make_pose(pose.rotation.matrix(), pose.translation)
             draft.sources[item.name] = item.path
+            if item.mask is not None:
+                draft.mask_files[item.name] = item.mask
     reasons = _reasons(work, models)
     drafts[0].rows += [{"image": name, "status": reason} for name, reason in reasons.items()]
     for draft in drafts:

@@ -40,11 +40,12 @@ TOLERANCE = 1e-3  # largest deviation of R^T R from the identity, per element, t
 def import_transforms(
     path: str | Path, capture: str | Path, device: str = "ios", split: str = "map", placing: str = "link",
     axes: str = "opengl", unit_m: float | None = None, hold_out: int = 0,
+    masks: str | Path | None = None,
 ) -> list[ImportReport]:  # fmt: skip
     """Make a session, or a map and a query session, from a transforms.json. Images keep their `file_path` as names.
 
     Args:
-        capture, device, split, placing: as for `interchange.import_colmap`.
+        capture, device, split, placing, masks: as for `interchange.import_colmap`.
         axes: camera axes of the matrices, see `drafts.AXES`.
         unit_m: meters per unit of the poses; None: unknown, as after structure from motion. The poses are then not
             scaled, and the session records that their unit is unknown.
@@ -64,7 +65,7 @@ def import_transforms(
         raise ManifestError(f"hold-out: found {hold_out} for a {split}, expected 2 or more, for a map.")
     path = Path(path)
     splits = (split, "query") if hold_out else (split,)
-    drafts = [start(capture, device, name, path.parent, placing) for name in splits]
+    drafts = [start(capture, device, name, path.parent, placing, masks) for name in splits]
     content = _read(path)
     frames: dict[str, _Frame] = {}
     for number, entry in enumerate(content["frames"]):

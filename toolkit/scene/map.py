@@ -222,7 +222,7 @@ class Map:
         """Return a query of images that one device took at one instant, given by their rows in a session."""
         turns = np.zeros(len(rows), np.int64) if self.turns is None else self.turns.of(session, rows)
         views = [
-            View(session.image_name(row), session.image_path(row), camera, in_map=False, turns=turn)
+            View(session.image_name(row), session.image_path(row), camera, False, turn, session.mask_path(row))
             for row, camera, turn in zip(rows.tolist(), session.cameras(rows), turns.tolist(), strict=True)
         ]
         return Query(views, session.rig_from_cam(rows))
