@@ -1,7 +1,6 @@
 """Import: COLMAP models and folders of images become sessions; what cannot be used is said."""
 
 import struct
-import sys
 import zlib
 from pathlib import Path
 
