@@ -236,6 +236,20 @@ def test_bad_cameras_are_rows(tmp_path: Path) -> None:
     assert [number for number, camera in model.cameras.items() if isinstance(camera, str)] == [1, 2, 3, 4, 5]
 
 
+def test_distortion_that_cannot_be_inverted_leaves_the_camera_out(tmp_path: Path, photos: Path) -> None:
+    cameras = (
+        "1 OPENCV 64 48 50 50 32 24 -44 300 0 0\n2 EQUIRECTANGULAR 64 48 64 48\n"
+        "3 SIMPLE_RADIAL 64 48 50 32 24 -0.3\n4 PINHOLE 64 48 50 50 32 24\n"
+    )
+    images = "".join(f"{k} {qt(k)} {k} {k}.jpg\n\n" for k in (1, 2, 3, 4))
+    report = import_colmap(write(tmp_path / "model", images, cameras), photos, tmp_path / "PLACE")
+    status = report.images.set_index("image")["status"]
+    assert list(status.index[status == "imported"]) == ["3.jpg", "4.jpg"]
+    assert "cannot be inverted" in status["1.jpg"]
+    assert "EQUIRECTANGULAR" in status["2.jpg"]
+    assert any("near the edge" in note and "import/cam_3" in note for note in report.notes)
+
+
 def test_binary_beside_text_is_said(tmp_path: Path) -> None:
     folder = binary(rig_model(tmp_path / "model"), tmp_path / "bin")
     assert read_model(folder).notes == []
