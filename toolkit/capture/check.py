@@ -102,6 +102,7 @@ def check_capture(path: str | Path, deep: bool = False) -> CheckReport:
             continue
         report.tables[session_id] = checker.summary()
         report.problems += checker.problems
+    report.problems += [Problem(name, "", 0, why, ERROR) for name, why in capture.unreadable.items()]
     return report
 
 

@@ -19,7 +19,7 @@ import pandas as pd
 import pycolmap
 
 from toolkit.capture import RAW_DATA, Trajectory, write_session
-from toolkit.capture.cameras import camera_text
+from toolkit.capture.cameras import camera_text, invertible_share
 from toolkit.capture.devices import SPLITS
 from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.images import (
@@ -40,6 +40,8 @@ from toolkit.manifest import nearest
 SUBSESSION = "import"
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 PLACING = ("link", "copy")
+MIN_INVERTIBLE = 0.9
+"""Smallest share of the image in which the distortion of a usable camera can be inverted."""
 NOT_INSIDE = "not a path inside the folder of images"
 AXES = {"opencv": np.eye(4), "opengl": np.diag([1.0, -1.0, -1.0, 1.0])}
 """named_from_cam (4, 4) for each named convention of camera axes: `opencv`, the toolkit's own, has x right, y down, z
@@ -150,6 +152,16 @@ class Draft:
     def leave_out(self) -> None:
         """Leave out the images that cannot be used; raise CaptureError if none is left."""
         problems = {image.name: self._problem(image) for image in self.images}
+        cameras = {image.sensor: image.camera for image in self.images}
+        share = {sensor: invertible_share(camera) for sensor, camera in cameras.items()}
+        for image in self.images:
+            if share[image.sensor] < MIN_INVERTIBLE and not problems[image.name]:
+                percent = f"{100 * (1 - share[image.sensor]):.0f} %"
+                problems[image.name] = f"the distortion of its camera cannot be inverted in {percent} of the image"
+        partly = [sensor for sensor, part in share.items() if MIN_INVERTIBLE <= part < 1]
+        if partly:
+            of = f"{', '.join(partly[:5])}{' and others' if len(partly) > 5 else ''} ({len(partly)} of {len(share)})"
+            self.notes.append(f"distortion that cannot be inverted near the edge of the image: {of}")
         self.rows += [{"image": name, "status": problem} for name, problem in problems.items() if problem]
         self.images = [image for image in self.images if not problems[image.name]]
         if not self.images:

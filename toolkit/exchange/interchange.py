@@ -83,11 +83,11 @@ def import_colmap(
         ]
     moved, names = 0, set[str]()
     for image_id, image in sorted(content.images.items()):
-        frame_id, frame = rig_of_image.get(image_id, (image_id, None))
+        frame_id, frame = rig_of_image.get(image_id, (f"image {image_id}", None))  # a frame may have the same number
         camera, pose = content.cameras.get(image.camera_id, "its camera is not in the model"), image.cam_from_world
         rig_name, sensor = None, f"{SUBSESSION}/cam_{image.camera_id}"
         if frame is not None:
-            rig_name, sensor = f"{SUBSESSION}/rig_{frame.rig_id}", sensors[frame.rig_id, image.camera_id]
+            rig_name, sensor = f"{SUBSESSION}/rig_{frame.rig_id}", sensors.get((frame.rig_id, image.camera_id), sensor)
             sensor_from_rig = content.rigs[frame.rig_id].get(image.camera_id)
             pose = frame.rig_from_world if sensor_from_rig is not None else "its camera has no pose in its rig"
             if not isinstance(pose, str) and not isinstance(image.cam_from_world, str):
