@@ -60,6 +60,7 @@ Settings = Annotated[
 Capture = Annotated[Path | None, Option(help="Capture folder, if it has moved since the run.")]
 Json = Annotated[bool, Option("--json", help="Print only a summary as JSON to stdout, everything else to stderr.")]
 _CLUSTER = "Dask workers: N on this machine, of a scheduler, or started by a cluster's queue (see docs/scaling.md)."
+_ONLY = "Run only this stage; `map`: build the maps without queries, for `localize`."
 _SWEEP = "Run once per value, each in its own folder, and compare. Repeat it to run all combinations."
 _FAILED = (
     "What to write for a query without a pose. `nearest`, the default: the pose of its best retrieved reference, as "
@@ -75,7 +76,7 @@ _TABLE = "CSV with a header: image; qw,qx,qy,qz,tx,ty,tz for poses; camera_id, o
 @app.command()
 def run(
     manifest: Annotated[Path, Argument(help="Manifest, for example data_manifests/demo.yaml.")],
-    only: Annotated[str | None, Option(metavar="STAGE", help="Run only this stage.")] = None,
+    only: Annotated[str | None, Option(metavar="STAGE", help=_ONLY)] = None,
     force: Annotated[bool, Option("--force", help="Also run stages that are up to date.")] = False,
     overrides: Settings = None,
     name: Annotated[str | None, Option(help="Name of the run folder; default: says what --set changes.")] = None,
@@ -109,6 +110,8 @@ def run(
             _print_json(_summary_of_stopped(manifest, overrides or (), name, in_place) | outcome)
         raise
     tell(f"Report: {run_dir / 'report.html'}")
+    if only == pipeline.MAP:
+        tell(f"Localize a photograph: python -m toolkit localize {run_dir} PHOTOGRAPH")
     result = summary(run_dir)
     if as_json:
         _print_json(result)
@@ -120,7 +123,7 @@ def run(
 def localize(
     run: Run,
     photographs: Annotated[list[Path], Argument(help="Image files.")],
-    device: Annotated[str, Option(help="Map device.")] = "ios",
+    device: Annotated[str | None, Option(help="Map device; default: the first of the run.")] = None,
     scene: Annotated[str | None, Option(help="Capture; default: the run's only one.")] = None,
     camera: Annotated[
         str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics; default: estimated from the matches.")
@@ -397,12 +400,13 @@ def reconstruct(
     if not manifest.exists():
         new_manifest(manifest.stem, capture)
     print(f"Manifest: {manifest}")
+    run_dir = pipeline.run(manifest, only=None if hold_out else pipeline.MAP)
     if hold_out:
-        run_dir = pipeline.run(manifest)
-        print(f"Report: {run_dir / 'report.html'}\nLocalize more: python -m toolkit localize {run_dir} PHOTOGRAPH")
-    else:
-        print(f"Import queries: python -m toolkit import images QUERIES {capture} --device {device}{result.camera}")
-        print(f"Then run it: python -m toolkit run {manifest}")
+        print(f"Report: {run_dir / 'report.html'}")
+    print(f"Localize a photograph: python -m toolkit localize {run_dir} PHOTOGRAPH --picture above.png")
+    if not hold_out:
+        print(f"Or many: python -m toolkit import images QUERIES {capture} --device {device}{result.camera}, and then")
+        print(f"python -m toolkit run {manifest}")
 
 
 @export_app.command("colmap")
