@@ -12,7 +12,7 @@ import json
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -150,7 +150,7 @@ def import_images(
 
 
 def import_once(
-    images: str | Path | None, capture: str | Path, device: str, split: str, unit_m: float | None = 1.0, **options: Any
+    images: str | Path, capture: str | Path, device: str, split: str, unit_m: float | None = 1.0, **options: Any
 ) -> str:
     """Import images, unless the session was imported before from the same input. Return a message for the user.
 
@@ -160,10 +160,8 @@ def import_once(
 
     Raises:
         CaptureError: the session was imported from other input (the message names it); or as for the imports.
-        ManifestError: no folder is given, or not the folder of the transforms.json; or as for the imports.
+        ManifestError: not the folder of the transforms.json; or as for the imports.
     """
-    if images is None:
-        raise ManifestError(f"{split}_images: found None, expected the folder of your images: other inputs are given.")
     session = Path(capture) / "sessions" / f"{device}_{split}"
     inputs: dict[str, Any] = {"images": str(Path(images).resolve()), **options}
     if unit_m != 1:  # sessions of earlier versions do not record it
@@ -174,10 +172,13 @@ def import_once(
             inputs[name] = str(Path(inputs[name]).resolve())
     if inputs.get("camera") is not None and _has_cameras(table=options.get("table"), cameras=options.get("cameras")):
         inputs["camera"] = None  # the table or cameras.txt override it
-    inputs["files of images"] = files_fingerprint([Path(images) / name for name in list_images(Path(images))])
-    record = session / IMPORT_RECORD
-    if not session.exists():
-        file = options.get("table")
+    try:
+        inputs["files of images"] = files_fingerprint([Path(images) / name for name in list_images(Path(images))])
+    except CaptureError as error:
+        raise CaptureError(f"{split}_images: {error}") from None
+
+    def make() -> str:
+        file, record = options.get("table"), session / IMPORT_RECORD
         if file is not None and _is_transforms(file):
             if Path(images).resolve() != Path(file).resolve().parent:
                 raise ManifestError(f"{split}_images: found {images}, expected the folder of {file}.")
@@ -187,8 +188,23 @@ def import_once(
         else:
             report = import_images(images, capture, device, split, unit_m=unit_m or 1.0, **options)
         unknown = {"unit": None} if unit_m is None else {}
-        write_text(record, json.dumps(read_json(record) | unknown | {"input": inputs}, indent=1) + "\n")
+        write_text(record, json.dumps(read_json(record) | unknown, indent=1) + "\n")
         return report.text()
+
+    return once(session, inputs, make)
+
+
+def once(session: Path, inputs: Mapping[str, Any], make: Callable[[], str]) -> str:
+    """Make a session, unless it was made before from the same inputs. Return a message for the user.
+
+    Raises:
+        CaptureError: the session was made from other inputs; names them.
+    """
+    record = session / IMPORT_RECORD
+    if not session.exists():
+        text = make()
+        write_text(record, json.dumps(read_json(record) | {"input": inputs}, indent=1) + "\n")
+        return text
     before = read_json(record).get("input", {})
     if differing := [name for name in inputs if before.get(name) != inputs[name]]:
         changes = "; ".join(
