@@ -135,10 +135,10 @@ def localize(
     import numpy as np
 
     from toolkit.capture import parse_camera
-    from toolkit.errors import CameraError, reason_of
+    from toolkit.errors import CameraError
     from toolkit.geometry import qt_from_pose
     from toolkit.scene import Run as FinishedRun
-    from toolkit.scene import localize_image
+    from toolkit.scene import localize_images
 
     try:
         given = None if camera is None else parse_camera("camera", camera)
@@ -146,19 +146,15 @@ def localize(
         raise CameraError(f"camera: {error}") from None
     place = FinishedRun.open(run).map(device, scene)
     rows, poses = [], [np.full((4, 4), np.nan)]
-    for path in photographs:
-        row: dict[str, Any] = {"image": str(path), "status": "", "world_from_cam": None}
-        try:
-            result = localize_image(place, path, given)
-            row |= {"status": result.status_text, "inliers": result.num_inliers, "remark": result.remark}
-            if result.world_from_rig is not None:
-                poses.append(result.world_from_rig)
-                row |= {"world_from_cam": result.world_from_rig.tolist(), "position_std_m": result.position_std_m}
-        except ToolkitError as error:
-            row["status"] = f"failed: {reason_of(error, f'localize {path}')}"
+    for path, result in zip(photographs, localize_images(place, photographs, given), strict=True):
+        row: dict[str, Any] = {"image": str(path), "status": result.status_text, "world_from_cam": None}
+        row |= {"inliers": result.num_inliers, "remark": result.remark}
+        if result.world_from_rig is not None:
+            poses.append(result.world_from_rig)
+            row |= {"world_from_cam": result.world_from_rig.tolist(), "position_std_m": result.position_std_m}
         rows.append(row)
         if not as_json:
-            print(f"{path}: {row['status']}. {row.get('remark', '')}")
+            print(f"{path}: {row['status']}. {row['remark']}".strip())
             if row["world_from_cam"] is not None:
                 qw, qx, qy, qz, *xyz = qt_from_pose(np.array(row["world_from_cam"])).tolist()
                 print(f"  position {xyz[0]:.3f} {xyz[1]:.3f} {xyz[2]:.3f}, qw qx qy qz "

@@ -12,7 +12,7 @@ import pycolmap
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from toolkit.capture.images import EXIF_CAMERA, HEADER_ERRORS, ORIENTATION, exif_camera, read_header, read_number
+from toolkit.capture.images import HEADER_ERRORS, ORIENTATION, exif_camera, exif_key, read_header, read_number
 from toolkit.errors import CaptureError, ImageError
 from toolkit.exchange.drafts import IMAGE_SUFFIXES, list_images
 from toolkit.files import write_atomic
@@ -199,7 +199,7 @@ def initial_cameras(
     keys: dict[Any, int] = {}
     numbers, cameras = list[int](), list[pycolmap.Camera]()
     for index, (item, size, folder) in enumerate(zip(photographs, sizes, folders, strict=True)):
-        tags = tuple(str(item.exif.get(tag, "")) for tag in EXIF_CAMERA)
+        tags = exif_key(item.exif)
         key = folder, size, tags, index if mixed[folder] and not any(tags) else None
         if key not in keys:
             keys[key] = len(cameras)
