@@ -63,6 +63,7 @@ Capture = Annotated[Path | None, Option(help="Capture folder, if it has moved si
 Json = Annotated[bool, Option("--json", help="Print only a summary as JSON to stdout, everything else to stderr.")]
 _CLUSTER = "Dask workers: N on this machine, of a scheduler, or started by a cluster's queue (see docs/scaling.md)."
 _KINDS = "7scenes, 12scenes, cambridge, aachen, eth3d, tum, kitti or euroc."
+_ONLY = "Run only this stage; `map`: build the maps without queries, for `localize`."
 _SWEEP = "Run once per value, each in its own folder, and compare. Repeat it to run all combinations."
 _FAILED = (
     "What to write for a query without a pose. `nearest`, the default: the pose of its best retrieved reference, as "
@@ -78,7 +79,7 @@ _TABLE = "CSV with a header: image; qw,qx,qy,qz,tx,ty,tz for poses; camera_id, o
 @app.command()
 def run(
     manifest: Annotated[Path, Argument(help="Manifest, for example data_manifests/demo.yaml.")],
-    only: Annotated[str | None, Option(metavar="STAGE", help="Run only this stage.")] = None,
+    only: Annotated[str | None, Option(metavar="STAGE", help=_ONLY)] = None,
     force: Annotated[bool, Option("--force", help="Also run stages that are up to date.")] = False,
     overrides: Settings = None,
     name: Annotated[str | None, Option(help="Name of the run folder; default: says what --set changes.")] = None,
@@ -112,6 +113,8 @@ def run(
             _print_json(_summary_of_stopped(manifest, overrides or (), name, in_place) | outcome)
         raise
     tell(f"Report: {run_dir / 'report.html'}")
+    if only == pipeline.MAP:
+        tell(f"Localize a photograph: python -m toolkit localize {run_dir} PHOTOGRAPH")
     result = summary(run_dir)
     if as_json:
         _print_json(result)
@@ -123,7 +126,7 @@ def run(
 def localize(
     run: Run,
     photographs: Annotated[list[Path], Argument(help="Image files.")],
-    device: Annotated[str, Option(help="Map device.")] = "ios",
+    device: Annotated[str | None, Option(help="Map device; default: the first of the run.")] = None,
     scene: Annotated[str | None, Option(help="Capture; default: the run's only one.")] = None,
     camera: Annotated[
         str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics; default: estimated from the matches.")
@@ -135,10 +138,10 @@ def localize(
     import numpy as np
 
     from toolkit.capture import parse_camera
-    from toolkit.errors import CameraError, reason_of
+    from toolkit.errors import CameraError
     from toolkit.geometry import qt_from_pose
     from toolkit.scene import Run as FinishedRun
-    from toolkit.scene import localize_image
+    from toolkit.scene import localize_images
 
     try:
         given = None if camera is None else parse_camera("camera", camera)
@@ -146,19 +149,15 @@ def localize(
         raise CameraError(f"camera: {error}") from None
     place = FinishedRun.open(run).map(device, scene)
     rows, poses = [], [np.full((4, 4), np.nan)]
-    for path in photographs:
-        row: dict[str, Any] = {"image": str(path), "status": "", "world_from_cam": None}
-        try:
-            result = localize_image(place, path, given)
-            row |= {"status": result.status_text, "inliers": result.num_inliers, "remark": result.remark}
-            if result.world_from_rig is not None:
-                poses.append(result.world_from_rig)
-                row |= {"world_from_cam": result.world_from_rig.tolist(), "position_std_m": result.position_std_m}
-        except ToolkitError as error:
-            row["status"] = f"failed: {reason_of(error, f'localize {path}')}"
+    for path, result in zip(photographs, localize_images(place, photographs, given), strict=True):
+        row: dict[str, Any] = {"image": str(path), "status": result.status_text, "world_from_cam": None}
+        row |= {"inliers": result.num_inliers, "remark": result.remark}
+        if result.world_from_rig is not None:
+            poses.append(result.world_from_rig)
+            row |= {"world_from_cam": result.world_from_rig.tolist(), "position_std_m": result.position_std_m}
         rows.append(row)
         if not as_json:
-            print(f"{path}: {row['status']}. {row.get('remark', '')}")
+            print(f"{path}: {row['status']}. {row['remark']}".strip())
             if row["world_from_cam"] is not None:
                 qw, qx, qy, qz, *xyz = qt_from_pose(np.array(row["world_from_cam"])).tolist()
                 print(f"  position {xyz[0]:.3f} {xyz[1]:.3f} {xyz[2]:.3f}, qw qx qy qz "
@@ -427,12 +426,13 @@ def reconstruct(
     if not manifest.exists():
         new_manifest(manifest.stem, capture)
     print(f"Manifest: {manifest}")
+    run_dir = pipeline.run(manifest, only=None if hold_out else pipeline.MAP)
     if hold_out:
-        run_dir = pipeline.run(manifest)
-        print(f"Report: {run_dir / 'report.html'}\nLocalize more: python -m toolkit localize {run_dir} PHOTOGRAPH")
-    else:
-        print(f"Import queries: python -m toolkit import images QUERIES {capture} --device {device}{result.camera}")
-        print(f"Then run it: python -m toolkit run {manifest}")
+        print(f"Report: {run_dir / 'report.html'}")
+    print(f"Localize a photograph: python -m toolkit localize {run_dir} PHOTOGRAPH --picture above.png")
+    if not hold_out:
+        print(f"Or many: python -m toolkit import images QUERIES {capture} --device {device}{result.camera}, and then")
+        print(f"python -m toolkit run {manifest}")
 
 
 @export_app.command("colmap")

@@ -314,6 +314,11 @@ def read_number(exif: Mapping[int, Any], tag: int) -> float:
     return number if np.isfinite(number) else 0.0
 
 
+def exif_key(exif: Mapping[int, Any]) -> tuple[str, ...]:
+    """Return make, model and focal lengths of a camera, empty where EXIF has none."""
+    return tuple(str(exif.get(tag, "")) for tag in EXIF_CAMERA)
+
+
 def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
     """Guess the intrinsics of an image from its EXIF tags: no distortion, principal point in the image center.
 

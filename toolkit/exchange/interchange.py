@@ -10,7 +10,7 @@ import csv
 import io
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -89,17 +89,17 @@ def import_colmap(
         if frame is not None:
             rig_name, sensor = f"{SUBSESSION}/rig_{frame.rig_id}", sensors.get((frame.rig_id, image.camera_id), sensor)
             sensor_from_rig = content.rigs[frame.rig_id].get(image.camera_id)
-            pose = frame.rig_from_world if sensor_from_rig is not None else "its camera has no pose in its rig"
-            if not isinstance(pose, str) and not isinstance(image.cam_from_world, str):
+            pose = "its camera has no pose in its rig" if sensor_from_rig is None else frame.rig_from_world
+            if not (sensor_from_rig is None or isinstance(pose, str) or isinstance(image.cam_from_world, str)):
                 moved += not np.allclose(sensor_from_rig @ pose, image.cam_from_world, rtol=1e-4, atol=1e-4)
-        unusable = "its name occurs twice in the model" if image.name in names else camera
-        unusable = unusable if isinstance(unusable, str) else pose
+        if image.name in names:
+            draft.rows.append({"image": image.name, "status": "its name occurs twice in the model"})
+        elif isinstance(camera, str) or isinstance(pose, str):
+            draft.rows.append({"image": image.name, "status": camera if isinstance(camera, str) else pose})
+        else:
+            draft.images.append(DraftImage(image.name, camera, sensor, f"{frame_id}", rig_name))
+            draft.poses[f"{frame_id}"] = invert(pose)
         names.add(image.name)
-        if isinstance(unusable, str) or isinstance(camera, str):
-            draft.rows.append({"image": image.name, "status": unusable})
-            continue
-        draft.images.append(DraftImage(image.name, camera, sensor, f"{frame_id}", rig_name))
-        draft.poses[f"{frame_id}"] = invert(unusable)
     if moved:
         draft.notes.append(f"{moved} images have another pose than their rig gives them: that of the rig is taken")
     not_in_model = set(list_images(draft.folder)) - names
@@ -169,7 +169,7 @@ def import_images(
 
 
 def import_once(
-    images: str | Path | None, capture: str | Path, device: str, split: str, unit_m: float | None = 1.0, **options: Any
+    images: str | Path, capture: str | Path, device: str, split: str, unit_m: float | None = 1.0, **options: Any
 ) -> str:
     """Import images, unless the session was imported before from the same input. Return a message for the user.
 
@@ -179,10 +179,8 @@ def import_once(
 
     Raises:
         CaptureError: the session was imported from other input (the message names it); or as for the imports.
-        ManifestError: no folder is given, or not the folder of the transforms.json; or as for the imports.
+        ManifestError: not the folder of the transforms.json; or as for the imports.
     """
-    if images is None:
-        raise ManifestError(f"{split}_images: found None, expected the folder of your images: other inputs are given.")
     session = Path(capture) / "sessions" / f"{device}_{split}"
     inputs: dict[str, Any] = {"images": str(Path(images).resolve()), **options}
     if unit_m != 1:  # sessions of earlier versions do not record it
@@ -193,10 +191,13 @@ def import_once(
             inputs[name] = str(Path(inputs[name]).resolve())
     if inputs.get("camera") is not None and _has_cameras(table=options.get("table"), cameras=options.get("cameras")):
         inputs["camera"] = None  # the table or cameras.txt override it
-    inputs["files of images"] = files_fingerprint([Path(images) / name for name in list_images(Path(images))])
-    record = session / IMPORT_RECORD
-    if not session.exists():
-        file = options.get("table")
+    try:
+        inputs["files of images"] = files_fingerprint([Path(images) / name for name in list_images(Path(images))])
+    except CaptureError as error:
+        raise CaptureError(f"{split}_images: {error}") from None
+
+    def make() -> str:
+        file, record = options.get("table"), session / IMPORT_RECORD
         if file is not None and _is_transforms(file):
             if Path(images).resolve() != Path(file).resolve().parent:
                 raise ManifestError(f"{split}_images: found {images}, expected the folder of {file}.")
@@ -206,8 +207,23 @@ def import_once(
         else:
             report = import_images(images, capture, device, split, unit_m=unit_m or 1.0, **options)
         unknown = {"unit": None} if unit_m is None else {}
-        write_text(record, json.dumps(read_json(record) | unknown | {"input": inputs}, indent=1) + "\n")
+        write_text(record, json.dumps(read_json(record) | unknown, indent=1) + "\n")
         return report.text()
+
+    return once(session, inputs, make)
+
+
+def once(session: Path, inputs: Mapping[str, Any], make: Callable[[], str]) -> str:
+    """Make a session, unless it was made before from the same inputs. Return a message for the user.
+
+    Raises:
+        CaptureError: the session was made from other inputs; names them.
+    """
+    record = session / IMPORT_RECORD
+    if not session.exists():
+        text = make()
+        write_text(record, json.dumps(read_json(record) | {"input": inputs}, indent=1) + "\n")
+        return text
     before = read_json(record).get("input", {})
     if differing := [name for name in inputs if before.get(name) != inputs[name]]:
         changes = "; ".join(
