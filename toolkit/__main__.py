@@ -52,6 +52,9 @@ QueryDevice = Annotated[str, Argument(help="Query device.")]
 TextFile = Annotated[Path, Argument(help="Text file.")]
 _AXES = "Camera axes of the poses. opencv: x right, y down, z forward; opengl: x right, y up, z backward."
 Axes = Annotated[str, Option("--axes", metavar="opencv|opengl", help=_AXES)]
+_DIRECTION = "Direction of the table's poses; the last has camera centers, as NVM, Bundler and Cambridge have them."
+HoldOut = Annotated[int, Option(metavar="N", help="Every Nth image becomes a query with truth; 0: none.")]
+Unit = Annotated[float | None, Option(metavar="METERS", help="Meters per unit of the poses if known.")]
 _NAMES = "Name imported images as in your folder (own), or as in the capture (capture)."
 Names = Annotated[str, Option("--names", metavar="own|capture", help=_NAMES)]
 Settings = Annotated[
@@ -306,12 +309,15 @@ def import_colmap(
     capture: Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
     device: Device = "ios",
     split: Annotated[str, Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
+    hold_out: HoldOut = 0,
+    unit: Unit = None,
+    axes: Axes = "opencv",
     placing: Placing = "link",
 ) -> None:
     """Make a session from a COLMAP model: cameras, poses, rigs."""
     from toolkit.exchange import interchange
 
-    print(interchange.import_colmap(model, images, capture, device, split, placing).text())
+    print(interchange.import_colmap(model, images, capture, device, split, placing, axes, unit, hold_out).text())
 
 
 @import_app.command("images")
@@ -322,8 +328,9 @@ def import_images(
     split: Annotated[str, Option(metavar="map|query", help="A map needs a table with poses.")] = "query",
     table: Annotated[Path | None, Option(help=_TABLE)] = None,
     poses_are: Annotated[
-        str, Option(metavar="world_from_cam|cam_from_world", help="Direction of the table's poses.")
+        str, Option(metavar="world_from_cam|cam_from_world|rotation_of_cam_from_world", help=_DIRECTION)
     ] = "world_from_cam",
+    hold_out: HoldOut = 0,
     axes: Axes = "opencv",
     unit: Annotated[float, Option(metavar="METERS", help="Meters per unit of the poses, e.g. 0.01.")] = 1.0,
     truth: Annotated[Path | None, Option(help="CSV like the table, with ground-truth poses of queries.")] = None,
@@ -337,7 +344,7 @@ def import_images(
     from toolkit.exchange import interchange
 
     report = interchange.import_images(
-        images, capture, device, split, table, poses_are, camera, cameras, placing, axes, unit, truth
+        images, capture, device, split, table, poses_are, camera, cameras, placing, axes, unit, truth, hold_out
     )
     print(report.text())
 
@@ -348,8 +355,8 @@ def import_transforms(
     capture: Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
     device: Device = "ios",
     split: Annotated[str, Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
-    hold_out: Annotated[int, Option(metavar="N", help="Every Nth image becomes a query with truth; 0: none.")] = 0,
-    unit: Annotated[float | None, Option(metavar="METERS", help="Meters per unit of the poses if known.")] = None,
+    hold_out: HoldOut = 0,
+    unit: Unit = None,
     axes: Axes = "opengl",
     placing: Placing = "link",
 ) -> None:

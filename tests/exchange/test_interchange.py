@@ -258,8 +258,96 @@ def test_a_list_of_queries_of_hloc_is_a_table(folder: Path, tmp_path: Path) -> N
     expected = [f"SIMPLE_RADIAL, 64, 48, {50 + number}.0, 30.0, 20.5, -0.01" for number in range(2)]
     assert cameras[names].tolist() == expected
     table.write_text("\n".join([lines[0], lines[1].replace("-0.01", "x")]))
-    with pytest.raises(CaptureError, match=r"queries_with_intrinsics\.txt, line 2"):
-        import_images(folder, tmp_path / "TWO", split="query", table=table)
+    status = import_images(folder, tmp_path / "TWO", split="query", table=table).images.set_index("image")["status"]
+    assert status["a/2.jpg"] == "imported"
+    assert "queries_with_intrinsics.txt, line 2" in status["b/1.jpg"]
+
+
+def test_rotations_of_cam_from_world_with_camera_centers(folder: Path, tmp_path: Path) -> None:
+    names = ["a/2.jpg", "a/10.png", "b/1.jpg"]
+    given = [make_pose(pose(k)[:3, :3].T, pose(k)[:3, 3]) for k in range(3)]
+    table = write_table(tmp_path / "t.csv", names, given)
+    options = {"split": "map", "table": table, "camera": CAMERA, "poses_are": "rotation_of_cam_from_world"}
+    import_images(folder, tmp_path / "PLACE", **options)
+    found = poses_of(Capture.open(tmp_path / "PLACE")["ios_map"])
+    for k, name in enumerate(names):
+        np.testing.assert_allclose(found[name], pose(k), rtol=0, atol=1e-9)
+
+
+def test_a_row_that_cannot_be_used_leaves_the_others(folder: Path, tmp_path: Path) -> None:
+    table = tmp_path / "t.csv"
+    table.write_text(
+        "image,qw,qx,qy,qz,tx,ty,tz,camera_id\na/2.jpg,nan,0,0,0,1,2,3,1\na/10.png,0.707,0.707,0,0,1,2,3,1\n"
+        "b/1.jpg,1,0,0,0,1,2,3,2\n"
+    )
+    cameras = tmp_path / "cameras.txt"
+    cameras.write_bytes("1 PINHOLE 64 48 50 51 32 24\r\n2 PINHOLE 64 48 0 51 32 24\r\n".encode("utf-16"))
+    report = import_images(folder, tmp_path / "PLACE", split="map", table=table, cameras=cameras)
+    status = report.images.set_index("image")["status"]
+    assert status["a/10.png"] == "imported"
+    assert "line 2" in status["a/2.jpg"]
+    assert "cameras.txt, line 2" in status["b/1.jpg"]
+    rotation = poses_of(Capture.open(tmp_path / "PLACE")["ios_map"])["a/10.png"][:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    truth = tmp_path / "truth.csv"
+    truth.write_text("image,qw,qx,qy,qz,tx,ty,tz\na/2.jpg,0,0,0,0,1,2,3\na/10.png,1,0,0,0,1,2,3\n")
+    report = import_images(folder, tmp_path / "PLACE", camera=CAMERA, truth=truth)
+    assert (report.images["status"] == "imported").all()
+    assert any("1 images have no usable ground truth; first: a/2.jpg: line 2" in note for note in report.notes)
+
+
+def test_a_table_in_utf16_is_read(folder: Path, tmp_path: Path) -> None:
+    table = write_table(tmp_path / "t.csv", ["a/2.jpg"], [pose(0)])
+    table.write_bytes(table.read_text().encode("utf-16"))
+    import_images(folder, tmp_path / "PLACE", split="map", table=table, camera=CAMERA)
+    np.testing.assert_allclose(poses_of(Capture.open(tmp_path / "PLACE")["ios_map"])["a/2.jpg"], pose(0), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("line", "name"), [("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "KITTI"), ("# time\n1305.1 1 2 3 0 0 0 1\n" * 3, "TUM")]
+)
+def test_lists_of_poses_without_names_are_recognized(line: str, name: str, folder: Path, tmp_path: Path) -> None:
+    table = tmp_path / "poses.txt"
+    table.write_text(line)
+    with pytest.raises(CaptureError, match=rf"poses\.txt: looks like {name}"):
+        import_images(folder, tmp_path / "PLACE", split="map", table=table, camera=CAMERA)
+
+
+def test_the_unit_and_the_axes_of_a_model(model: Path, tmp_path: Path) -> None:
+    report = import_colmap(model, tmp_path / "photos", tmp_path / "A", device="hl")
+    assert any(note.startswith("unit of the poses: not known") for note in report.notes)
+    assert Capture.open(tmp_path / "A").unit is None
+    report = import_colmap(model, tmp_path / "photos", tmp_path / "B", device="hl", unit_m=0.5, axes="opengl")
+    assert not any("unit" in note for note in report.notes)
+    assert Capture.open(tmp_path / "B").unit == "m"
+    given, found = (poses_of(Capture.open(tmp_path / place)["hl_map"]) for place in "AB")
+    assert given.keys() == found.keys()
+    for name in given:
+        expected = given[name] @ np.diag([1.0, -1, -1, 1])
+        expected[:3, 3] *= 0.5
+        np.testing.assert_allclose(found[name], expected, rtol=0, atol=1e-9)
+
+
+def test_frames_are_held_out_as_queries(model: Path, tmp_path: Path, folder: Path) -> None:
+    whole = import_colmap(model, tmp_path / "photos", tmp_path / "WHOLE", device="hl")
+    report = import_colmap(model, tmp_path / "photos", tmp_path / "PLACE", device="hl", hold_out=2)
+    capture = Capture.open(tmp_path / "PLACE")
+    assert report.held_out is not None
+    assert f"{report.held_out.session}" in report.text()
+    parts = [poses_of(capture[name]) for name in ("hl_map", "hl_query")]
+    assert sorted(parts[1]) == ["phone/2.jpg", "rig/5.jpg"], "the second and fourth frame"
+    expected = poses_of(Capture.open(whole.session.parents[1])["hl_map"])
+    assert parts[0].keys() | parts[1].keys() == expected.keys()
+    for name, one in (parts[0] | parts[1]).items():
+        np.testing.assert_array_equal(one, expected[name])
+    assert check_capture(tmp_path / "PLACE").errors == []
+    table = write_table(tmp_path / "t.csv", ["a/2.jpg", "a/10.png", "b/1.jpg"], [pose(k) for k in range(3)])
+    options = {"split": "map", "table": table, "camera": CAMERA}
+    report = import_images(folder, tmp_path / "TABLE", hold_out=3, **options)
+    assert list(report.images["image"]) == ["a/2.jpg", "a/10.png"]
+    with pytest.raises(ManifestError, match="hold-out: found 4, but there are 3"):
+        import_images(folder, tmp_path / "OTHER", hold_out=4, **options)
+    assert not (tmp_path / "OTHER").exists()
 
 
 def test_cameras_come_from_a_file_or_the_table(folder: Path, tmp_path: Path) -> None:

@@ -47,6 +47,7 @@ class ImportReport:
     session: Path
     images: pd.DataFrame  # image, status (`imported` or why not), path, timestamp, sensor_id, device_id, camera
     notes: list[str] = field(default_factory=list)  # guesses, made-up values, and anything the user should look at
+    held_out: "ImportReport | None" = None  # the queries that were made of a part of the images
 
     def text(self) -> str:
         """Return the report as text."""
@@ -57,6 +58,7 @@ class ImportReport:
         lines += [f"left out: {row.image}: {row.status}" for row in left_out.head(10).itertuples()]
         if len(left_out) > 10:
             lines.append(f"... and {len(left_out) - 10} more, see proc/import.csv")
+        lines += [self.held_out.text()] if self.held_out is not None else []
         return "\n".join(lines)
 
 
@@ -104,6 +106,47 @@ class Draft:
         self.images.append(DraftImage(name, camera, sensor, name))
         if world_from_cam is not None:
             self.poses[name] = world_from_cam
+
+    def convert(self, axes: str, unit_m: float | None) -> None:
+        """Change poses from camera axes of `AXES` and a unit of `unit_m` meters; None: unknown, which is noted."""
+        if axes != "opencv" or unit_m not in (None, 1):
+            turn = AXES[axes]
+            self.poses = {frame: posed_camera(pose, axes, unit_m or 1.0) for frame, pose in self.poses.items()}
+            self.rigs = [
+                (rig, sensor, posed_camera(turn @ pose, axes, unit_m or 1.0)) for rig, sensor, pose in self.rigs
+            ]
+        self.note_unit(unit_m)
+
+    def note_unit(self, unit_m: float | None) -> None:
+        """Record and note that the unit of the poses is not known, if `unit_m` is None."""
+        if unit_m is None:
+            self.unit = None
+            self.notes.append(
+                "unit of the poses: not known. If you know its length in meters, give --unit METERS (1 if a phone's "
+                "tracking or a scanner gave the poses). Lengths are otherwise relative to the depth of the scene"
+            )
+
+    def hold_out(self, number: int) -> "Draft | None":
+        """Move every `number`-th frame, in order of names, to the draft of a query session; None if `number` is 0.
+
+        Raises:
+            CaptureError: the query session exists.
+            ManifestError: a number that is not 0 or between 2 and the number of frames.
+        """
+        require_hold_out(number, self.session.name.rpartition("_")[2], len({image.frame for image in self.images}))
+        if not number:
+            return None
+        queries = start(
+            self.session.parents[1], self.session.name.removesuffix("_map"), "query", self.folder, self.placing
+        )
+        frames = list(dict.fromkeys(image.frame for image in sorted(self.images, key=lambda image: image.name)))
+        held = set(frames[number - 1 :: number])
+        queries.images = [image for image in self.images if image.frame in held]
+        self.images = [image for image in self.images if image.frame not in held]
+        queries.poses = {frame: pose for frame, pose in self.poses.items() if frame in held}
+        self.poses = {frame: pose for frame, pose in self.poses.items() if frame not in held}
+        queries.rigs, queries.unit, queries.sources = self.rigs, self.unit, self.sources
+        return queries
 
     def source(self, name: str) -> Path:
         """Return the file of an image."""
@@ -238,6 +281,22 @@ def write_drafts(*drafts: Draft) -> list[ImportReport]:
     for draft in drafts:
         draft.leave_out()
     return [draft.write() for draft in drafts]
+
+
+def write_with_queries(draft: Draft, hold_out: int) -> ImportReport:
+    """Write a session and, with `hold_out`, the queries of it; see `Draft.hold_out` and `write_drafts`."""
+    queries = draft.hold_out(hold_out)
+    report, *others = write_drafts(draft, *([queries] if queries else []))
+    report.held_out = others[0] if others else None
+    return report
+
+
+def require_hold_out(number: int, split: str, count: int) -> None:
+    """Raise ManifestError unless `number` is 0, or 2 to `count` images for a map."""
+    if number and (number < 2 or split != "map"):
+        raise ManifestError(f"hold-out: found {number} for a {split}, expected 2 or more, for a map.")
+    if number > count:
+        raise ManifestError(f"hold-out: found {number}, but there are {count} frames. Give a smaller number.")
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[str]:

@@ -28,8 +28,16 @@ import pycolmap
 from toolkit.capture import parse_camera
 from toolkit.capture.images import is_file, read_header
 from toolkit.capture.tables import FARTHEST_M
-from toolkit.errors import CaptureError, ImageError, ManifestError
-from toolkit.exchange.drafts import IMAGE_SUFFIXES, ImportReport, posed_camera, require_convention, start, write_drafts
+from toolkit.errors import CaptureError, ImageError
+from toolkit.exchange.drafts import (
+    IMAGE_SUFFIXES,
+    ImportReport,
+    posed_camera,
+    require_convention,
+    require_hold_out,
+    start,
+    write_drafts,
+)
 from toolkit.geometry import Floats
 
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -60,8 +68,7 @@ def import_transforms(
             `hold_out`.
     """
     require_convention(axes, 1.0 if unit_m is None else unit_m)
-    if hold_out and (hold_out < 2 or split != "map"):
-        raise ManifestError(f"hold-out: found {hold_out} for a {split}, expected 2 or more, for a map.")
+    require_hold_out(hold_out, split, hold_out)
     path = Path(path)
     splits = (split, "query") if hold_out else (split,)
     drafts = [start(capture, device, name, path.parent, placing) for name in splits]
@@ -72,8 +79,7 @@ def import_transforms(
         if frame.name in frames:
             raise frame.error("file_path", f"that of frame {frames[frame.name].number} again", "one frame per image")
         frames[frame.name] = frame
-    if hold_out > len(frames):
-        raise ManifestError(f"hold-out: found {hold_out}, but there are {len(frames)} frames. Give a smaller number.")
+    require_hold_out(hold_out, split, len(frames))
     for index, name in enumerate(sorted(frames)):
         draft = drafts[1 if hold_out and index % hold_out == hold_out - 1 else 0]
         pose = posed_camera(frames[name].world_from_named(), axes, unit_m or 1.0)
@@ -88,12 +94,7 @@ def import_transforms(
     if not_in_file:
         drafts[0].notes.append(f"{len(not_in_file)} images beside these are not in {path.name}")
     for draft in drafts:
-        if unit_m is None:
-            draft.unit = None
-            draft.notes.append(
-                "unit of the poses: not known. If you know its length in meters, give --unit METERS (1 if a phone's "
-                "tracking or a scanner gave the poses). Lengths are otherwise relative to the depth of the scene"
-            )
+        draft.note_unit(unit_m)
     return write_drafts(*drafts)
 
 
