@@ -55,6 +55,10 @@ Axes = Annotated[str, Option("--axes", metavar="opencv|opengl", help=_AXES)]
 _DIRECTION = "Direction of the table's poses; the last has camera centers, as NVM, Bundler and Cambridge have them."
 HoldOut = Annotated[int, Option(metavar="N", help="Every Nth image becomes a query with truth; 0: none.")]
 Unit = Annotated[float | None, Option(metavar="METERS", help="Meters per unit of the poses if known.")]
+MatchNames = Annotated[
+    bool, Option("--match-names", help="Take files whose names differ only in case, extension or separators.")
+]
+_APPLIED = "Undo applied_transform and applied_scale, by which nerfstudio has changed the world of its input."
 _NAMES = "Name imported images as in your folder (own), or as in the capture (capture)."
 Names = Annotated[str, Option("--names", metavar="own|capture", help=_NAMES)]
 Settings = Annotated[
@@ -312,12 +316,16 @@ def import_colmap(
     hold_out: HoldOut = 0,
     unit: Unit = None,
     axes: Axes = "opencv",
+    match_names: MatchNames = False,
     placing: Placing = "link",
 ) -> None:
     """Make a session from a COLMAP model: cameras, poses, rigs."""
     from toolkit.exchange import interchange
 
-    print(interchange.import_colmap(model, images, capture, device, split, placing, axes, unit, hold_out).text())
+    report = interchange.import_colmap(
+        model, images, capture, device, split, placing, axes, unit, hold_out, match_names
+    )
+    print(report.text())
 
 
 @import_app.command("images")
@@ -338,14 +346,18 @@ def import_images(
         str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all images; else guessed from EXIF.")
     ] = None,
     cameras: Annotated[Path | None, Option(help="COLMAP's cameras.txt.")] = None,
+    only: Annotated[list[str] | None, Option(metavar="PATTERN", help="Only such images: '*.color.png'.")] = None,
+    skip: Annotated[list[str] | None, Option(metavar="PATTERN", help="No such images: 'masks/*'.")] = None,
+    match_names: MatchNames = False,
     placing: Placing = "link",
 ) -> None:
     """Make a session from a folder of images: a map with poses, or queries."""
     from toolkit.exchange import interchange
 
     report = interchange.import_images(
-        images, capture, device, split, table, poses_are, camera, cameras, placing, axes, unit, truth, hold_out
-    )
+        images, capture, device, split, table, poses_are, camera, cameras, placing, axes, unit, truth, hold_out,
+        match_names, only, skip,
+    )  # fmt: skip
     print(report.text())
 
 
@@ -358,12 +370,16 @@ def import_transforms(
     hold_out: HoldOut = 0,
     unit: Unit = None,
     axes: Axes = "opengl",
+    undo_applied: Annotated[bool, Option("--undo-applied", help=_APPLIED)] = False,
+    match_names: MatchNames = False,
     placing: Placing = "link",
 ) -> None:
     """Make a session from a transforms.json: cameras with distortion, poses."""
     from toolkit.exchange.transforms import import_transforms
 
-    for report in import_transforms(transforms, capture, device, split, placing, axes, unit, hold_out):
+    for report in import_transforms(
+        transforms, capture, device, split, placing, axes, unit, hold_out, undo_applied, match_names
+    ):
         print(report.text())
 
 

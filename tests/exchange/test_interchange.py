@@ -350,6 +350,89 @@ def test_frames_are_held_out_as_queries(model: Path, tmp_path: Path, folder: Pat
     assert not (tmp_path / "OTHER").exists()
 
 
+@pytest.mark.parametrize(
+    ("listed", "stored", "flag"),
+    [
+        ("A/IMG.JPG", "a/img.jpg", True),
+        ("a/img.png", "a/img.jpg", True),
+        ("a\\img.jpg", "a/img.jpg", True),
+        ("a/caf\u00e9.jpg", "a/cafe\u0301.jpg", False),
+        ("a/cafe\u0301.jpg", "a/caf\u00e9.jpg", False),
+        ("A/caf\u00e9.png", "a/cafe\u0301.jpg", True),
+    ],
+)
+def test_names_that_differ_a_little_from_their_files(listed: str, stored: str, flag: bool, tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    save(photos / stored)
+    save(photos / "other.jpg")
+    table = write_table(tmp_path / "t.csv", [listed], [pose(3)])
+    options = {"split": "map", "table": table, "camera": CAMERA}
+    if flag:
+        with pytest.raises(CaptureError, match=r"1 images differ from their files in case.*--match-names"):
+            import_images(photos, tmp_path / "PLACE", **options)
+    report = import_images(photos, tmp_path / "PLACE", match_names=flag, **options)
+    assert list(report.images["image"]) == [stored]
+    assert any("names of 1 images differ" in note for note in report.notes)
+    np.testing.assert_allclose(poses_of(Capture.open(tmp_path / "PLACE")["ios_map"])[stored], pose(3), atol=1e-9)
+
+
+def test_names_that_fit_two_files_are_not_guessed(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    for name in ("img.jpg", "IMG.png", "good.jpg"):
+        save(photos / name)
+    table = write_table(tmp_path / "t.csv", ["Img.jpg", "good.jpg"], [pose(3), pose(4)])
+    report = import_images(photos, tmp_path / "PLACE", split="map", table=table, camera=CAMERA, match_names=True)
+    assert report.images.set_index("image")["status"].to_dict() == {"Img.jpg": "no such file", "good.jpg": "imported"}
+
+
+def test_files_that_are_not_photographs_are_said(folder: Path, tmp_path: Path) -> None:
+    for name in ("x.heic", "y.HEIC", "z.gif"):
+        (folder / name).write_bytes(b"anything")
+    (folder / "caf\udce9.jpg").write_bytes(b"not Unicode")
+    PIL.Image.new("RGB", SIZE).save(folder / "t.tiff")
+    report = import_images(folder, tmp_path / "PLACE", camera=CAMERA)
+    assert sorted(report.images["image"]) == ["a/10.png", "a/2.jpg", "b/1.jpg", "t.tiff"]
+    assert (report.images["status"] == "imported").all()
+    text = report.text()
+    assert "2 files .heic are not read: pip install" in text
+    assert "1 files .gif are not read" in text
+    assert "1 images have a name that is not UTF-8" in text
+    assert check_capture(tmp_path / "PLACE", deep=True).problems == []
+
+
+def test_depth_and_masks_beside_photographs(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    rng = np.random.default_rng(0)
+    for k in range(2):
+        color = rng.integers(0, 255, (48, 64, 3)).astype(np.uint8)
+        (photos / "masks").mkdir(parents=True, exist_ok=True)
+        PIL.Image.fromarray(color).save(photos / f"{k}.color.png")
+        PIL.Image.fromarray((color[..., 0] * 255).astype(np.uint16)).save(photos / f"{k}.depth.png")
+        PIL.Image.fromarray(np.uint8(255) * (color[..., 0] > 99).astype(np.uint8)).save(photos / "masks" / f"{k}.png")
+    report = import_images(photos, tmp_path / "A", camera=CAMERA)
+    assert "have 16 bits or two values" in report.text()
+    for place, options in (("B", {"only": ["*.color.png"]}), ("C", {"skip": ["*.depth.png", "masks/*"]})):
+        report = import_images(photos, tmp_path / place, camera=CAMERA, **options)
+        assert list(report.images["image"]) == ["0.color.png", "1.color.png"]
+        assert "16 bits" not in report.text()
+        assert "4 images are left out by --only and --skip" in report.text()
+    with pytest.raises(CaptureError, match="none of 6 images fits"):
+        import_images(photos, tmp_path / "D", camera=CAMERA, only=["*.jpeg"])
+
+
+def test_a_capture_in_the_folder_of_photographs_is_skipped(folder: Path) -> None:
+    for place in (folder / "place", folder):
+        import_images(folder, place, camera=CAMERA)
+        report = import_images(folder, place, "spot", camera=CAMERA)
+        assert len(report.images) == 3
+        assert any("captures in the folder" in note for note in report.notes)
+
+
+def test_a_device_whose_session_name_would_be_too_long(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(ManifestError, match="40 bytes"):
+        import_images(folder, tmp_path / "PLACE", "a" * 60, camera=CAMERA)
+
+
 def test_cameras_come_from_a_file_or_the_table(folder: Path, tmp_path: Path) -> None:
     cameras = tmp_path / "cameras.txt"
     cameras.write_text("# Camera list\n3 PINHOLE 64 48 50 51 32 24\n8 SIMPLE_RADIAL 64 48 40 32 24 0.01\n")

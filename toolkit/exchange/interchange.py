@@ -10,22 +10,27 @@ import csv
 import io
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pandas as pd
 import pycolmap
 
 from toolkit.capture import parse_camera
 from toolkit.capture.folder import IMPORT_RECORD
-from toolkit.capture.images import exif_camera
+from toolkit.capture.images import decode, exif_camera
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.colmap_model import NORM_TOLERANCE, encoding_of, is_number, read_cameras, read_model
 from toolkit.exchange.drafts import (
+    READ_SUFFIXES,
     SUBSESSION,
+    Draft,
     DraftImage,
     ImportReport,
     list_images,
@@ -46,6 +51,7 @@ _CAMERA_COLUMNS = ("model", "width", "height", "params")
 def import_colmap(
     model: str | Path, images: str | Path, capture: str | Path, device: str = "ios", split: str = "map",
     placing: str = "link", axes: str = "opencv", unit_m: float | None = None, hold_out: int = 0,
+    match_names: bool = False,
 ) -> ImportReport:  # fmt: skip
     """Make a session from a COLMAP model and its images: cameras, poses, and the rigs that have several cameras.
 
@@ -64,6 +70,7 @@ def import_colmap(
             scaled, and the session records that their unit is unknown.
         hold_out: every `hold_out`-th frame of a map, in order of names, becomes a query with ground truth instead;
             0: none.
+        match_names: take files whose names differ only in case, extension or separators.
 
     Raises:
         CaptureError: no model in the folder, or a damaged one; the session exists already, or no image is left.
@@ -72,6 +79,7 @@ def import_colmap(
     """
     require_convention(axes, 1.0 if unit_m is None else unit_m)
     draft = start(capture, device, split, Path(images), placing)
+    draft.match_names = match_names
     content = read_model(Path(model))
     draft.notes += content.notes
     rig_of_image = {
@@ -87,7 +95,7 @@ def import_colmap(
             (f"{SUBSESSION}/rig_{rig_id}", sensors[rig_id, camera_id], invert(sensor_from_rig))
             for camera_id, sensor_from_rig in calibrated.items()
         ]
-    moved, names = 0, set[str]()
+    moved, names, not_in_model = 0, set[str](), set[str]()
     for image_id, image in sorted(content.images.items()):
         frame_id, frame = rig_of_image.get(image_id, (f"image {image_id}", None))  # a frame may have the same number
         camera, pose = content.cameras.get(image.camera_id, "its camera is not in the model"), image.cam_from_world
@@ -108,7 +116,8 @@ def import_colmap(
         draft.poses[f"{frame_id}"] = invert(unusable)
     if moved:
         draft.notes.append(f"{moved} images have another pose than their rig gives them: that of the rig is taken")
-    not_in_model = set(list_images(draft.folder)) - names
+    with suppress(CaptureError):  # the model may be of images in other formats
+        not_in_model = set(list_images(draft.folder)) - names
     if not_in_model:
         draft.notes.append(f"{len(not_in_model)} images of the folder are not in the model")
     draft.convert(axes, unit_m)
@@ -119,7 +128,7 @@ def import_images(
     images: str | Path, capture: str | Path, device: str = "ios", split: str = "query", table: str | Path | None = None,
     poses_are: str = "world_from_cam", camera: str | None = None, cameras: str | Path | None = None,
     placing: str = "link", axes: str = "opencv", unit_m: float | None = 1.0, truth: str | Path | None = None,
-    hold_out: int = 0,
+    hold_out: int = 0, match_names: bool = False, only: Sequence[str] | None = None, skip: Sequence[str] | None = None,
 ) -> ImportReport:  # fmt: skip
     """Make a session from a folder of images without rigs.
 
@@ -140,7 +149,8 @@ def import_images(
         unit_m: meters per unit of the poses; None: unknown, see `import_colmap`.
         truth: CSV file like the table; its poses become the ground truth of queries. Images not in it are queries
             without ground truth.
-        hold_out: as for `import_colmap`.
+        hold_out, match_names: as for `import_colmap`.
+        only, skip: patterns such as `*.color.png`, without a table; only images of these names, and none of those.
 
     Raises:
         CaptureError: a malformed table or camera (names file and line), an image without intrinsics, a map without
@@ -154,7 +164,11 @@ def import_images(
     draft, folder = start(capture, device, split, Path(images), placing), Path(images)
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder of images.")
-    rows = _read_table(Path(table)) if table is not None else pd.DataFrame({"image": list_images(folder), "line": 0})
+    draft.match_names = match_names
+    if table is not None:
+        rows = _read_table(Path(table))
+    else:
+        rows = pd.DataFrame({"image": _listed(draft, folder, only or (), skip or ()), "line": 0})
     if split == "map" and "qw" not in rows:
         given = f"a table with the columns image, {', '.join(POSE_NAMES)}"
         raise CaptureError(f"A map needs poses: give {given}, or import a transforms.json or a COLMAP model.")
@@ -211,7 +225,8 @@ def import_once(
             inputs[name] = str(Path(inputs[name]).resolve())
     if inputs.get("camera") is not None and _has_cameras(table=options.get("table"), cameras=options.get("cameras")):
         inputs["camera"] = None  # the table or cameras.txt override it
-    inputs["files of images"] = files_fingerprint([Path(images) / name for name in list_images(Path(images))])
+    names = list_images(Path(images), READ_SUFFIXES)
+    inputs["files of images"] = files_fingerprint([Path(images) / name for name in names])
     record = session / IMPORT_RECORD
     if not session.exists():
         file = options.get("table")
@@ -220,7 +235,7 @@ def import_once(
                 raise ManifestError(f"{split}_images: found {images}, expected the folder of {file}.")
             if (found := options.get("poses_are", POSE_DIRECTIONS[0])) != POSE_DIRECTIONS[0]:
                 raise ManifestError(f"poses_are: found {found!r}, expected world_from_cam, the direction in {file}.")
-            report = import_transforms(file, capture, device, split, unit_m=unit_m)[0]
+            report = import_transforms(file, capture, device, split, unit_m=unit_m, own_split=False)[0]
         else:
             report = import_images(images, capture, device, split, unit_m=unit_m, **options)
         unknown = {"unit": None} if unit_m is None else {}
@@ -254,6 +269,37 @@ def _sensors_of_rigs(rigs: Mapping[int, Mapping[int, Floats | None]]) -> dict[tu
 
 
 # Cameras
+
+
+def _listed(draft: Draft, folder: Path, only: Sequence[str], skip: Sequence[str]) -> list[str]:
+    """Return the images of a folder that fit the patterns, and note what is left out or looks like no photograph."""
+    names = list_images(folder, READ_SUFFIXES, draft.notes)
+    chosen = [name for name in names if not only or any(_fits(name, pattern) for pattern in only)]
+    chosen = [name for name in chosen if not any(_fits(name, pattern) for pattern in skip)]
+    if not chosen:
+        raise CaptureError(f"{folder}: none of {len(names)} images fits the patterns {', '.join([*only, *skip])}.")
+    if len(chosen) < len(names):
+        draft.notes.append(f"{len(names) - len(chosen)} images are left out by --only and --skip")
+    pngs = [name for name in chosen if name.lower().endswith(".png")]
+    sample = pngs[:: max(1, len(pngs) // 40)]
+    flat = [name for name in sample if _is_no_photograph(folder / name)]
+    if flat and len(flat) / len(sample) * len(pngs) >= 0.5 * len(chosen):
+        kinds = f"{len(flat)} of {len(sample)} PNG files that were looked at, such as {flat[0]}, have 16 bits or two"
+        draft.notes.append(f"{kinds} values, like depth and masks: leave such out with --only or --skip")
+    return chosen
+
+
+def _fits(name: str, pattern: str) -> bool:
+    return fnmatch(name, pattern) or fnmatch(Path(name).name, pattern)
+
+
+def _is_no_photograph(path: Path) -> bool:
+    """Tell whether an image has 16 bits in one channel, or at most two values."""
+    try:
+        pixels = decode(path, cv2.IMREAD_UNCHANGED)
+    except ImageError:
+        return False
+    return (pixels.dtype == np.uint16 and pixels.ndim == 2) or len(np.unique(pixels[::2, ::2])) <= 2
 
 
 def _camera(params: str, where: str) -> pycolmap.Camera:
