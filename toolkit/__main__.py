@@ -54,6 +54,13 @@ QueryDevice = Annotated[str, Argument(help="Query device.")]
 TextFile = Annotated[Path, Argument(help="Text file.")]
 _AXES = "Camera axes of the poses. opencv: x right, y down, z forward; opengl: x right, y up, z backward."
 Axes = Annotated[str, Option("--axes", metavar="opencv|opengl", help=_AXES)]
+_DIRECTION = "Direction of the table's poses; the last has camera centers, as NVM, Bundler and Cambridge have them."
+HoldOut = Annotated[int, Option(metavar="N", help="Every Nth image becomes a query with truth; 0: none.")]
+Unit = Annotated[float | None, Option(metavar="METERS", help="Meters per unit of the poses if known.")]
+MatchNames = Annotated[
+    bool, Option("--match-names", help="Take files whose names differ only in case, extension or separators.")
+]
+_APPLIED = "Undo applied_transform and applied_scale, by which nerfstudio has changed the world of its input."
 _NAMES = "Name imported images as in your folder (own), or as in the capture (capture)."
 Names = Annotated[str, Option("--names", metavar="own|capture|file", help=_NAMES)]
 Settings = Annotated[
@@ -308,13 +315,20 @@ def import_colmap(
     capture: Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
     device: Device = "ios",
     split: Annotated[str, Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
+    hold_out: HoldOut = 0,
+    unit: Unit = None,
+    axes: Axes = "opencv",
+    match_names: MatchNames = False,
     placing: Placing = "link",
     masks: Masks = None,
 ) -> None:
     """Make a session from a COLMAP model: cameras, poses, rigs."""
     from toolkit.exchange import interchange
 
-    print(interchange.import_colmap(model, images, capture, device, split, placing, masks).text())
+    report = interchange.import_colmap(
+        model, images, capture, device, split, placing, axes, unit, hold_out, match_names, masks
+    )
+    print(report.text())
 
 
 @import_app.command("images")
@@ -325,8 +339,9 @@ def import_images(
     split: Annotated[str, Option(metavar="map|query", help="A map needs a table with poses.")] = "query",
     table: Annotated[Path | None, Option(help=_TABLE)] = None,
     poses_are: Annotated[
-        str, Option(metavar="world_from_cam|cam_from_world", help="Direction of the table's poses.")
+        str, Option(metavar="world_from_cam|cam_from_world|rotation_of_cam_from_world", help=_DIRECTION)
     ] = "world_from_cam",
+    hold_out: HoldOut = 0,
     axes: Axes = "opencv",
     unit: Annotated[float, Option(metavar="METERS", help="Meters per unit of the poses, e.g. 0.01.")] = 1.0,
     truth: Annotated[Path | None, Option(help="CSV like the table, with ground-truth poses of queries.")] = None,
@@ -334,6 +349,9 @@ def import_images(
         str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all images; else guessed from EXIF.")
     ] = None,
     cameras: Annotated[Path | None, Option(help="COLMAP's cameras.txt.")] = None,
+    only: Annotated[list[str] | None, Option(metavar="PATTERN", help="Only such images: '*.color.png'.")] = None,
+    skip: Annotated[list[str] | None, Option(metavar="PATTERN", help="No such images: 'masks/*'.")] = None,
+    match_names: MatchNames = False,
     placing: Placing = "link",
     masks: Masks = None,
 ) -> None:
@@ -341,8 +359,9 @@ def import_images(
     from toolkit.exchange import interchange
 
     report = interchange.import_images(
-        images, capture, device, split, table, poses_are, camera, cameras, placing, axes, unit, truth, masks
-    )
+        images, capture, device, split, table, poses_are, camera, cameras, placing, axes, unit, truth, hold_out,
+        match_names, only, skip, masks,
+    )  # fmt: skip
     print(report.text())
 
 
@@ -352,16 +371,20 @@ def import_transforms(
     capture: Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
     device: Device = "ios",
     split: Annotated[str, Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
-    hold_out: Annotated[int, Option(metavar="N", help="Every Nth image becomes a query with truth; 0: none.")] = 0,
-    unit: Annotated[float | None, Option(metavar="METERS", help="Meters per unit of the poses if known.")] = None,
+    hold_out: HoldOut = 0,
+    unit: Unit = None,
     axes: Axes = "opengl",
+    undo_applied: Annotated[bool, Option("--undo-applied", help=_APPLIED)] = False,
+    match_names: MatchNames = False,
     placing: Placing = "link",
     masks: Masks = None,
 ) -> None:
     """Make a session from a transforms.json: cameras with distortion, poses."""
     from toolkit.exchange.transforms import import_transforms
 
-    for report in import_transforms(transforms, capture, device, split, placing, axes, unit, hold_out, masks):
+    for report in import_transforms(
+        transforms, capture, device, split, placing, axes, unit, hold_out, undo_applied, match_names, masks=masks
+    ):
         print(report.text())
 
 

@@ -581,7 +581,7 @@ _TYPES: dict[str, Any] = {
     "device": str | list[str],
     "inspect": int | str,
     "pairs": Annotated[list[Pair], Field(strict=False)] | None,
-    "poses_are": Literal["world_from_cam", "cam_from_world"],
+    "poses_are": Literal["world_from_cam", "cam_from_world", "rotation_of_cam_from_world"],
     "others": Annotated[list[Folder], Field(strict=False)] | None,
     "unit_m": float | None,
 }

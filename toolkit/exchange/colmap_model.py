@@ -89,6 +89,22 @@ def read_model(folder: Path) -> ColmapModel:
     return model
 
 
+def read_cameras(path: Path) -> dict[str, pycolmap.Camera | str]:
+    """Return the cameras in cameras.txt or cameras.bin by id as text; each may be why it cannot be used.
+
+    Raises:
+        CaptureError: the file is missing, damaged (names line or byte), or has no camera.
+    """
+    model = ColmapModel()
+    try:
+        (_binary_cameras if path.suffix == ".bin" else _text_cameras)(path, model)
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read ({error}). Expected COLMAP's cameras.txt.") from None
+    if not model.cameras:
+        raise CaptureError(f"{path}: no camera in it. Expected lines of `CAMERA_ID MODEL WIDTH HEIGHT PARAMS...`.")
+    return {str(number): camera for number, camera in model.cameras.items()}
+
+
 def _formats(folder: Path) -> list[str]:
     """Return the suffixes of the formats in which a folder has cameras and images."""
     return [suffix for suffix in _SUFFIXES if all((folder / f"{name}{suffix}").is_file() for name in _NEEDED)]
@@ -123,11 +139,13 @@ def _pose(values: Sequence[float]) -> Floats | str:
     return pose_from_qt(np.r_[row[:4] / norm, row[4:]])
 
 
-def _camera(model_name: str, size: Sequence[Any], params: Sequence[Any]) -> pycolmap.Camera | str:
+def _camera(
+    model_name: str, size: Sequence[Any], params: Sequence[Any], where: str = ""
+) -> pycolmap.Camera | str:
     try:
         return parse_camera("camera", ", ".join([model_name, *map(str, size), *map(str, params)]))
     except ValueError as error:
-        return f"its camera cannot be used: {error}"
+        return f"its camera cannot be used: {where}{error}"
 
 
 def _add_rig(model: ColmapModel, rig_id: int, cameras: dict[int, Floats | None], sensors: int) -> None:
@@ -143,7 +161,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
     number = 0
     try:
         # Names are those of files, which may have any bytes.
-        with path.open(encoding=_encoding(path), errors="surrogateescape") as lines:
+        with path.open(encoding=encoding_of(path), errors="surrogateescape") as lines:
             for number, line in enumerate(lines, start=1):
                 if not line.startswith("#"):
                     yield number, line.strip(" \t\r\n")
@@ -151,7 +169,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
         raise CaptureError(f"{path}, line {number + 1}: cannot be read as UTF-16 ({error}).") from None
 
 
-def _encoding(path: Path) -> str:
+def encoding_of(path: Path) -> str:
     """Return the encoding of a text file: UTF-16 by its mark or its zeros, else UTF-8."""
     with path.open("rb") as file:
         start = file.read(64)
@@ -177,7 +195,9 @@ def _text_cameras(path: Path, model: ColmapModel) -> None:
         if words := line.split():
             if len(words) < 4 or not words[0].isdecimal():
                 raise _malformed(path, number, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]")
-            model.cameras[_new(path, "camera", int(words[0]), model.cameras)] = _camera(words[1], words[2:4], words[4:])
+            model.cameras[_new(path, "camera", int(words[0]), model.cameras)] = _camera(
+                words[1], words[2:4], words[4:], f"{path.name}, line {number}: "
+            )
 
 
 def _text_images(path: Path, model: ColmapModel) -> None:
@@ -201,7 +221,7 @@ def _text_images(path: Path, model: ColmapModel) -> None:
             raise _malformed(path, number, line, expected)
     if without_points:
         model.notes.append(f"{path.name}: {without_points} images have no line of points, which is not needed")
-    with path.open(encoding=_encoding(path), errors="replace") as file:
+    with path.open(encoding=encoding_of(path), errors="replace") as file:
         stated = re.search(r"# *Number of images: *(\d+)", file.read(2000))
     if stated and int(stated[1]) != len(model.images):
         model.notes.append(f"{path.name}: {len(model.images)} images, its header says {int(stated[1])}")
@@ -215,17 +235,17 @@ def _is_image(words: Sequence[str]) -> bool:
     if len(words) < 10 or not words[0].isdecimal() or not words[8].isdecimal():
         return False
     name = words[9].split()
-    return len(name) == 1 or not (_is_number(name[0]) and _is_number(name[-1]))
+    return len(name) == 1 or not (is_number(name[0]) and is_number(name[-1]))
 
 
 def _is_points(line: str) -> bool:
     """Tell whether a line is X Y POINT3D_ID for each point, by its length and its first point: it may be long."""
     words = line.split(maxsplit=3)
     numbers = line.count(" ") + 1 if "  " not in line and "\t" not in line else len(line.split())
-    return not words or (numbers % 3 == 0 and all(map(_is_number, words[:2])) and words[2].lstrip("-").isdecimal())
+    return not words or (numbers % 3 == 0 and all(map(is_number, words[:2])) and words[2].lstrip("-").isdecimal())
 
 
-def _is_number(word: str) -> bool:
+def is_number(word: str) -> bool:
     try:
         float(word)
     except ValueError:
