@@ -26,7 +26,7 @@ from toolkit.capture.images import default_workers, prefetch
 from toolkit.embedders.vlad import Vlad
 from toolkit.errors import CaptureError, ManifestError, WeightsError
 from toolkit.exchange.drafts import SUBSESSION, Draft, DraftImage, ImportReport, start, write_drafts
-from toolkit.exchange.georeference import place, read_positions
+from toolkit.exchange.georeference import RECORD, place, read_positions
 from toolkit.exchange.photographs import Photograph, gather, initial_cameras
 from toolkit.features.features import KINDS, LocalFeatures
 from toolkit.features.matching import (
@@ -49,7 +49,6 @@ from toolkit.threads import one_thread
 log = logging.getLogger(__name__)
 
 FOLDER = "reconstruction"
-RECORD = "proc/reconstruction.json"
 ALL_PAIRS = 60  # up to this number of photographs, all pairs are matched
 NEIGHBORS, SIMILAR = 10, 20  # else each photograph with so many next ones in its folder, and so many that look similar
 MIN_INLIERS = 15  # of a pair that counts
