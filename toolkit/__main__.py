@@ -375,6 +375,26 @@ def import_images(
     print(report.text())
 
 
+@import_app.command("panoramas")
+def import_panoramas(
+    images: Annotated[Path, Argument(help="Folder of equirectangular JPEG and PNG files, of the whole sphere.")],
+    capture: Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
+    device: Device = "ios",
+    split: Annotated[str, Option(metavar="map|query", help="A map needs a table with poses.")] = "query",
+    table: Annotated[Path | None, Option(help="CSV: image,qw,qx,qy,qz,tx,ty,tz of each panorama.")] = None,
+    poses_are: Annotated[
+        str, Option(metavar="world_from_cam|cam_from_world", help="Direction of the table's poses.")
+    ] = "world_from_cam",
+    axes: Axes = "opencv",
+    unit: Annotated[float, Option(metavar="METERS", help="Meters per unit of the poses, e.g. 0.01.")] = 1.0,
+    masks: Masks = None,
+) -> None:
+    """Make a session of 360-degree panoramas: each becomes a rig of perspective views."""
+    from toolkit.exchange.panoramas import import_panoramas
+
+    print(import_panoramas(images, capture, device, split, table, poses_are, axes, unit, masks).text())
+
+
 @import_app.command("transforms")
 def import_transforms(
     transforms: Annotated[Path, Argument(help="transforms.json of nerfstudio or instant-ngp, near its images.")],
