@@ -45,6 +45,8 @@ USAGE, INTERRUPTED = 2, 130
 
 Device = Annotated[str, Option(help="Device type: ios, hl, spot or another name.")]
 Placing = Annotated[str, Option("--images", metavar="link|copy", help="Link to the images, or copy them.")]
+_MASKS = "Folder of masks, black where to use no features: 1.jpg.png of 1.jpg. Default: `masks` beside or in IMAGES."
+Masks = Annotated[Path | None, Option(help=_MASKS)]
 Run = Annotated[Path, Argument(help="Run folder.")]
 Scene = Annotated[str, Argument(help="Name of the capture.")]
 MapDevice = Annotated[str, Argument(help="Map device.")]
@@ -60,13 +62,15 @@ MatchNames = Annotated[
 ]
 _APPLIED = "Undo applied_transform and applied_scale, by which nerfstudio has changed the world of its input."
 _NAMES = "Name imported images as in your folder (own), or as in the capture (capture)."
-Names = Annotated[str, Option("--names", metavar="own|capture", help=_NAMES)]
+Names = Annotated[str, Option("--names", metavar="own|capture|file", help=_NAMES)]
 Settings = Annotated[
     list[str] | None, Option("--set", metavar="KEY=VALUE", help="Replace a setting; `run`: in a new run.")
 ]
 Capture = Annotated[Path | None, Option(help="Capture folder, if it has moved since the run.")]
 Json = Annotated[bool, Option("--json", help="Print only a summary as JSON to stdout, everything else to stderr.")]
 _CLUSTER = "Dask workers: N on this machine, of a scheduler, or started by a cluster's queue (see docs/scaling.md)."
+_KINDS = "7scenes, 12scenes, cambridge, aachen, eth3d, tum, kitti or euroc."
+_ONLY = "Run only this stage; `map`: build the maps without queries, for `localize`."
 _SWEEP = "Run once per value, each in its own folder, and compare. Repeat it to run all combinations."
 _FAILED = (
     "What to write for a query without a pose. `nearest`, the default: the pose of its best retrieved reference, as "
@@ -82,7 +86,7 @@ _TABLE = "CSV with a header: image; qw,qx,qy,qz,tx,ty,tz for poses; camera_id, o
 @app.command()
 def run(
     manifest: Annotated[Path, Argument(help="Manifest, for example data_manifests/demo.yaml.")],
-    only: Annotated[str | None, Option(metavar="STAGE", help="Run only this stage.")] = None,
+    only: Annotated[str | None, Option(metavar="STAGE", help=_ONLY)] = None,
     force: Annotated[bool, Option("--force", help="Also run stages that are up to date.")] = False,
     overrides: Settings = None,
     name: Annotated[str | None, Option(help="Name of the run folder; default: says what --set changes.")] = None,
@@ -116,6 +120,8 @@ def run(
             _print_json(_summary_of_stopped(manifest, overrides or (), name, in_place) | outcome)
         raise
     tell(f"Report: {run_dir / 'report.html'}")
+    if only == pipeline.MAP:
+        tell(f"Localize a photograph: python -m toolkit localize {run_dir} PHOTOGRAPH")
     result = summary(run_dir)
     if as_json:
         _print_json(result)
@@ -127,7 +133,7 @@ def run(
 def localize(
     run: Run,
     photographs: Annotated[list[Path], Argument(help="Image files.")],
-    device: Annotated[str, Option(help="Map device.")] = "ios",
+    device: Annotated[str | None, Option(help="Map device; default: the first of the run.")] = None,
     scene: Annotated[str | None, Option(help="Capture; default: the run's only one.")] = None,
     camera: Annotated[
         str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics; default: estimated from the matches.")
@@ -139,10 +145,10 @@ def localize(
     import numpy as np
 
     from toolkit.capture import parse_camera
-    from toolkit.errors import CameraError, reason_of
+    from toolkit.errors import CameraError
     from toolkit.geometry import qt_from_pose
     from toolkit.scene import Run as FinishedRun
-    from toolkit.scene import localize_image
+    from toolkit.scene import localize_images
 
     try:
         given = None if camera is None else parse_camera("camera", camera)
@@ -150,19 +156,15 @@ def localize(
         raise CameraError(f"camera: {error}") from None
     place = FinishedRun.open(run).map(device, scene)
     rows, poses = [], [np.full((4, 4), np.nan)]
-    for path in photographs:
-        row: dict[str, Any] = {"image": str(path), "status": "", "world_from_cam": None}
-        try:
-            result = localize_image(place, path, given)
-            row |= {"status": result.status_text, "inliers": result.num_inliers, "remark": result.remark}
-            if result.world_from_rig is not None:
-                poses.append(result.world_from_rig)
-                row |= {"world_from_cam": result.world_from_rig.tolist(), "position_std_m": result.position_std_m}
-        except ToolkitError as error:
-            row["status"] = f"failed: {reason_of(error, f'localize {path}')}"
+    for path, result in zip(photographs, localize_images(place, photographs, given), strict=True):
+        row: dict[str, Any] = {"image": str(path), "status": result.status_text, "world_from_cam": None}
+        row |= {"inliers": result.num_inliers, "remark": result.remark}
+        if result.world_from_rig is not None:
+            poses.append(result.world_from_rig)
+            row |= {"world_from_cam": result.world_from_rig.tolist(), "position_std_m": result.position_std_m}
         rows.append(row)
         if not as_json:
-            print(f"{path}: {row['status']}. {row.get('remark', '')}")
+            print(f"{path}: {row['status']}. {row['remark']}".strip())
             if row["world_from_cam"] is not None:
                 qw, qx, qy, qz, *xyz = qt_from_pose(np.array(row["world_from_cam"])).tolist()
                 print(f"  position {xyz[0]:.3f} {xyz[1]:.3f} {xyz[2]:.3f}, qw qx qy qz "
@@ -318,12 +320,13 @@ def import_colmap(
     axes: Axes = "opencv",
     match_names: MatchNames = False,
     placing: Placing = "link",
+    masks: Masks = None,
 ) -> None:
     """Make a session from a COLMAP model: cameras, poses, rigs."""
     from toolkit.exchange import interchange
 
     report = interchange.import_colmap(
-        model, images, capture, device, split, placing, axes, unit, hold_out, match_names
+        model, images, capture, device, split, placing, axes, unit, hold_out, match_names, masks
     )
     print(report.text())
 
@@ -350,13 +353,14 @@ def import_images(
     skip: Annotated[list[str] | None, Option(metavar="PATTERN", help="No such images: 'masks/*'.")] = None,
     match_names: MatchNames = False,
     placing: Placing = "link",
+    masks: Masks = None,
 ) -> None:
     """Make a session from a folder of images: a map with poses, or queries."""
     from toolkit.exchange import interchange
 
     report = interchange.import_images(
         images, capture, device, split, table, poses_are, camera, cameras, placing, axes, unit, truth, hold_out,
-        match_names, only, skip,
+        match_names, only, skip, masks,
     )  # fmt: skip
     print(report.text())
 
@@ -373,14 +377,36 @@ def import_transforms(
     undo_applied: Annotated[bool, Option("--undo-applied", help=_APPLIED)] = False,
     match_names: MatchNames = False,
     placing: Placing = "link",
+    masks: Masks = None,
 ) -> None:
     """Make a session from a transforms.json: cameras with distortion, poses."""
     from toolkit.exchange.transforms import import_transforms
 
     for report in import_transforms(
-        transforms, capture, device, split, placing, axes, unit, hold_out, undo_applied, match_names
+        transforms, capture, device, split, placing, axes, unit, hold_out, undo_applied, match_names, masks=masks
     ):
         print(report.text())
+
+
+@import_app.command("dataset")
+def import_dataset(
+    kind: Annotated[str, Argument(metavar="KIND", help=_KINDS)],
+    path: Annotated[Path, Argument(help="Folder of the data set as published, or of one of its scenes.")],
+    capture: Annotated[Path, Argument(help="New capture folder, with a map and a query session.")],
+    scene: Annotated[str | None, Option(help="Scene below PATH, e.g. chess.")] = None,
+    device: Device = "ios",
+    every: Annotated[int, Option(min=1, metavar="N", help="Take every Nth image of each folder.")] = 1,
+    hold_out: Annotated[int, Option(min=2, metavar="N", help="Every Nth image is a query, without a split.")] = 8,
+    placing: Placing = "link",
+) -> None:
+    """Make a map and queries from a data set of the field, and a manifest with its thresholds."""
+    from toolkit.exchange.datasets import LAYOUTS, import_dataset
+    from toolkit.exchange.new_manifest import new_manifest
+
+    for report in import_dataset(kind, path, capture, scene, device, every, hold_out, placing):
+        print(report.text())
+    name = re.sub(r"[^A-Za-z0-9._-]", "-", capture.resolve().name)
+    print(f"Run it: python -m toolkit run {new_manifest(name, capture, thresholds=LAYOUTS[kind].thresholds)}")
 
 
 @app.command()
@@ -398,6 +424,7 @@ def reconstruct(
     positions: Annotated[Path | None, Option(help="CSV: image,x,y,z, known camera centers in meters.")] = None,
     mapper: Annotated[str, Option(metavar="incremental|global", help="COLMAP's mapper.")] = "incremental",
     placing: Placing = "link",
+    masks: Masks = None,
 ) -> None:
     """Make a map from photographs or videos without poses, by structure from motion."""
     from toolkit import pipeline
@@ -412,7 +439,9 @@ def reconstruct(
     manifest = Path("data_manifests") / f"{re.sub(r'[^A-Za-z0-9._-]', '-', capture.resolve().name)}.yaml"
     if manifest.exists() and str(capture) not in manifest.read_text(encoding="utf-8"):
         raise ManifestError(f"{manifest} is about another capture. Rename it, or give {capture} another name.")
-    result = reconstruct(photos, capture, device, hold_out, fps, camera, distance, positions, mapper, placing)
+    result = reconstruct(
+        photos, capture, device, hold_out, fps, camera, distance, positions, mapper, placing, masks
+    )
     print(result.text())
     picture = capture / FOLDER / "cameras.png"
     draw_top_view(Capture.open(capture), points=result.points, colors=result.colors).savefig(picture)
@@ -420,12 +449,13 @@ def reconstruct(
     if not manifest.exists():
         new_manifest(manifest.stem, capture)
     print(f"Manifest: {manifest}")
+    run_dir = pipeline.run(manifest, only=None if hold_out else pipeline.MAP)
     if hold_out:
-        run_dir = pipeline.run(manifest)
-        print(f"Report: {run_dir / 'report.html'}\nLocalize more: python -m toolkit localize {run_dir} PHOTOGRAPH")
-    else:
-        print(f"Import queries: python -m toolkit import images QUERIES {capture} --device {device}{result.camera}")
-        print(f"Then run it: python -m toolkit run {manifest}")
+        print(f"Report: {run_dir / 'report.html'}")
+    print(f"Localize a photograph: python -m toolkit localize {run_dir} PHOTOGRAPH --picture above.png")
+    if not hold_out:
+        print(f"Or many: python -m toolkit import images QUERIES {capture} --device {device}{result.camera}, and then")
+        print(f"python -m toolkit run {manifest}")
 
 
 @export_app.command("colmap")

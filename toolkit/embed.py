@@ -374,7 +374,7 @@ def _images_fingerprint(session: Session, rows: NDArray[np.intp]) -> str:
     """Return a fingerprint of images: their keys, and the name, size and time of change of their files."""
     table = session.images.iloc[rows]
     keys = [table[column].tolist() for column in ("timestamp", "sensor_id", "path")]
-    files = files_fingerprint([session.image_path(int(row)) for row in rows])
+    files = files_fingerprint([*map(session.image_path, rows.tolist()), *session.mask_paths(rows.tolist())])
     return fingerprint([keys, session.device_ids[rows].tolist(), files])
 
 

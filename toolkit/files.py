@@ -462,6 +462,8 @@ class SceneFiles:
         return self.poses_dir / f"{pair_name(self.scene, map_device, query_device)}_sequence.txt"
 
 
+MASKS = "masks"
+"""Folder of the masks of a session, or beside a folder of images."""
 IMPORTED = "import/images/"
 """Folder of imported images, relative to a session's `raw_data`."""
 

@@ -253,12 +253,12 @@ def walk(capture: Path, step: list[float], turn: float = 0.01, frames: int = 12,
     qt[:, 0], qt[:, 2], qt[:, 4:] = np.cos(angles), np.sin(angles), np.outer(np.arange(frames), step)
     qt[:still, 4:] = 0.01 * np.arange(still)[:, None] / max(still, 1)  # about a tripod
     session = capture / "sessions" / "hl_map"
-    rows = [(time, "s/a", f"s/a/{time}.jpg") for time in range(frames)]
+    rows = [(time, "s/a", f"s/a/{time}.jpg") for time in range(0, 50_000 * frames, 50_000)]
     for _, _, path in rows:
         Image.new("RGB", (64, 48)).save(session / "raw_data" / path)
     shutil.rmtree(session / "proc", ignore_errors=True)
     (session / "rigs.txt").unlink(missing_ok=True)
-    poses = Trajectory(np.arange(frames), ["s/a"] * frames, qt)
+    poses = Trajectory(50_000 * np.arange(frames), ["s/a"] * frames, qt)
     write_session(session, [("s/a", "", *PINHOLE)], None, poses, rows, subsessions=["s"])
 
 

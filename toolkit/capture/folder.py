@@ -102,7 +102,8 @@ class Capture:
             return present
         if not present:
             expected = f"sessions/<device>_{split}, as made by `python -m toolkit import ... --split {split}`"
-            raise CaptureError(f"{self.path}: no {split} session. Expected {expected}.")
+            alone = " Without queries, build the map: run MANIFEST --only map." if split == "query" else ""
+            raise CaptureError(f"{self.path}: no {split} session. Expected {expected}.{alone}")
         if device not in present:
             known = f"Devices with one: {', '.join(present)} (or `all`)"
             raise CaptureError(f"No {split} session of device {device!r} in {self.path}. {known}.")

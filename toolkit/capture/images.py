@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from PIL import JpegImagePlugin, PngImagePlugin
 
 from toolkit.errors import ImageError
+from toolkit.files import MASKS
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -46,6 +47,7 @@ ORIENTATION, _EXIF, _TIME, _SUBSECOND, _ZONE = 0x0112, 0x8769, 0x9003, 0x9291, 0
 _FOCAL_MM, _FOCAL_35MM, _WIDTH = 0x920A, 0xA405, 0xA002
 _PLANE_X, _PLANE_UNIT = 0xA20E, 0xA210
 _UNIT_MM = {0.0: 25.4, 2.0: 25.4, 3.0: 10.0, 4.0: 1.0}  # 0, a missing tag, means inches
+_MASK_DEPTH = 4  # largest number of folders and files in the path of an image below the folder of images
 NO_FILE = "no such file"
 EXIF_CAMERA = (0x010F, 0x0110, _FOCAL_MM, _FOCAL_35MM)
 """EXIF tags that distinguish cameras: make, model and focal lengths."""
@@ -261,6 +263,23 @@ def is_file(path: Path) -> bool:
     return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises for too long a name
 
 
+def find_mask(image: Path, masks: Path | None = None) -> Path | None:
+    """Return the mask of an image file, which is black where to extract no features; None without one.
+
+    As in COLMAP, that of `images/a/1.jpg` is `masks/a/1.jpg.png`; the folder `masks` may also be in `images` or in `a`.
+
+    Args:
+        masks: folder of the masks, if it is another one.
+    """
+    path = image.absolute()
+    for depth in range(min(_MASK_DEPTH, len(path.parts) - 2), 0, -1):  # of the image in the folder of images
+        name = Path(*path.parts[-depth:-1], f"{path.name}.png")
+        roots = [masks] if masks is not None else [path.parents[depth - 1] / MASKS, path.parents[depth] / MASKS]
+        if found := next((root / name for root in roots if is_file(root / name)), None):
+            return found
+    return None
+
+
 def read_header(path: Path) -> tuple[tuple[int, int], dict[int, Any]]:
     """Return the stored width and height of an image, and its EXIF tags by number.
 
@@ -301,6 +320,11 @@ def read_number(exif: Mapping[int, Any], tag: int) -> float:
     except (TypeError, ValueError, ZeroDivisionError):
         return 0.0
     return number if np.isfinite(number) else 0.0
+
+
+def exif_key(exif: Mapping[int, Any]) -> tuple[str, ...]:
+    """Return make, model and focal lengths of a camera, empty where EXIF has none."""
+    return tuple(str(exif.get(tag, "")) for tag in EXIF_CAMERA)
 
 
 def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:

@@ -13,6 +13,7 @@ A session may have 200,000 images, sensors and rigs. Tables are therefore kept a
 numbers), and no Python code loops over rows while a session is read.
 """
 
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property, lru_cache
 from html import escape
@@ -44,7 +45,7 @@ from toolkit.capture.tables import (
 )
 from toolkit.capture.trajectory import Trajectory
 from toolkit.errors import CaptureError
-from toolkit.files import files_fingerprint, own_name
+from toolkit.files import MASKS, files_fingerprint, own_name
 from toolkit.geometry import Floats, Ints, pose_from_qt
 
 if TYPE_CHECKING:
@@ -198,6 +199,22 @@ class Session:
         """
         return self._raw_data / self.images["path"].iloc[row]
 
+    def mask_path(self, row: int) -> Path | None:
+        """Return the mask of an image, the file `masks/<path>.png` that is black where to extract no features, or None.
+
+        The name is COLMAP's, with the image's path relative to raw_data.
+        """
+        path = self.path / MASKS / f"{self.images['path'].iloc[row]}.png" if self._has_masks else None
+        return path if path is not None and os.path.lexists(path) else None  # a broken link is no missing mask
+
+    @cached_property
+    def _has_masks(self) -> bool:
+        return (self.path / MASKS).is_dir()
+
+    def mask_paths(self, rows: Iterable[int]) -> list[Path]:
+        """Return the masks of those of the images that have one."""
+        return [path for row in rows if (path := self.mask_path(row)) is not None] if self._has_masks else []
+
     def image_name(self, row: int) -> str:
         """Return the name of an image in the whole capture: its path relative to sessions/."""
         return f"{self.path.name}/{RAW_DATA}/{self.images['path'].iloc[row]}"
@@ -262,8 +279,9 @@ class Session:
 
     @cached_property
     def files_fingerprint(self) -> str:
-        """16 hex digits that identify the image files at first use."""
-        return files_fingerprint([self.image_path(row) for row in range(len(self.images))])
+        """16 hex digits that identify the image files, and their masks, at first use."""
+        rows = range(len(self.images))
+        return files_fingerprint([*map(self.image_path, rows), *self.mask_paths(rows)])
 
     @cached_property
     def depths_fingerprint(self) -> str:

@@ -25,10 +25,20 @@ from toolkit.capture import RAW_DATA, Trajectory, write_session
 from toolkit.capture.cameras import camera_text, invertible_share
 from toolkit.capture.devices import SPLITS
 from toolkit.capture.folder import IMPORT_RECORD
-from toolkit.capture.images import NO_FILE, ORIENTATION, is_file, read_header, read_number, time_taken, zone_of
+from toolkit.capture.images import (
+    NO_FILE,
+    ORIENTATION,
+    find_mask,
+    is_file,
+    read_header,
+    read_number,
+    stored_size,
+    time_taken,
+    zone_of,
+)
 from toolkit.capture.names import EXPECTED_NAME, has_long_part, is_bad_name, note_linked_here
 from toolkit.errors import CaptureError, ImageError, ManifestError
-from toolkit.files import IMPORTED, write_folder
+from toolkit.files import IMPORTED, MASKS, write_folder
 from toolkit.geometry import Floats, make_pose
 from toolkit.manifest import nearest
 
@@ -110,13 +120,22 @@ class Draft:
     unit: str | None = "m"  # unit of the poses; None: unknown
     notes: list[str] = field(default_factory=list)
     sources: dict[str, Path] = field(default_factory=dict)  # files that are not in `folder` under their names
+    given_times: int = 0  # images whose time is not from EXIF
+    masks: Path | None = None  # folder of masks as COLMAP names them; None: see `images.find_mask`
+    mask_files: dict[str, Path] = field(default_factory=dict)  # those that are not in `masks` under their names
     match_names: bool = False  # take files whose names differ only in case, extension or separators
     sensors: dict[str, str] = field(default_factory=dict)  # id by `camera_text`, for images that are not in a rig
 
-    def add(self, name: str, camera: pycolmap.Camera, world_from_cam: Floats | None) -> None:
-        """Add an image that is not in a rig. Images with equal intrinsics share a camera."""
+    def add(
+        self, name: str, camera: pycolmap.Camera, world_from_cam: Floats | None, time_us: int | None = None
+    ) -> None:
+        """Add an image that is not in a rig. Images with equal intrinsics share a camera.
+
+        Args:
+            time_us: when it was taken, microseconds; None: from EXIF.
+        """
         sensor = self.sensors.setdefault(camera_text(camera), f"{SUBSESSION}/cam_{len(self.sensors) + 1}")
-        self.images.append(DraftImage(name, camera, sensor, name))
+        self.images.append(DraftImage(name, camera, sensor, name, time_us=time_us))
         if world_from_cam is not None:
             self.poses[name] = world_from_cam
 
@@ -150,8 +169,9 @@ class Draft:
         if not number:
             return None
         queries = start(
-            self.session.parents[1], self.session.name.removesuffix("_map"), "query", self.folder, self.placing
-        )
+            self.session.parents[1], self.session.name.removesuffix("_map"), "query", self.folder, self.placing,
+            self.masks,
+        )  # fmt: skip
         frames = list(dict.fromkeys(image.frame for image in sorted(self.images, key=lambda image: image.name)))
         held = set(frames[number - 1 :: number])
         queries.images = [image for image in self.images if image.frame in held]
@@ -159,11 +179,35 @@ class Draft:
         queries.poses = {frame: pose for frame, pose in self.poses.items() if frame in held}
         self.poses = {frame: pose for frame, pose in self.poses.items() if frame not in held}
         queries.rigs, queries.unit, queries.sources = self.rigs, self.unit, self.sources
+        queries.mask_files, queries.match_names = self.mask_files, self.match_names
         return queries
 
     def source(self, name: str) -> Path:
         """Return the file of an image."""
         return self.sources.get(name, self.folder / name)
+
+    def _find_masks(self) -> dict[str, Path]:
+        """Return the masks of the images by name, and note how many images have one.
+
+        Raises:
+            CaptureError: the user gave a folder of masks, but no image has one there.
+        """
+        found = {image.name: self.mask_files.get(image.name) or find_mask(self.source(image.name), self.masks)
+                 for image in self.images}  # fmt: skip
+        masks = {name: path for name, path in found.items() if path is not None}
+        first = self.images[0].name
+        if self.masks is not None and not masks:
+            raise CaptureError(f"{self.masks}: no mask of {self.folder}. Expected that of {first} as {first}.png.")
+        if masks:
+            self.notes.append(f"masks of {len(masks)} of {len(found)} images; no features where they are black")
+        for image in self.images:
+            size = stored_size(masks[image.name]) if image.name in masks else (image.camera.width, image.camera.height)
+            if size != (image.camera.width, image.camera.height):
+                self.notes.append(
+                    f"{masks[image.name]}: {size[0]} x {size[1]} pixels, expected {image.camera.width} x "
+                    f"{image.camera.height}, as {image.name}, which has no features until you correct its mask"
+                )
+        return masks
 
     def leave_out(self) -> None:
         """Leave out the images that cannot be used; raise CaptureError if none is left."""
@@ -225,7 +269,7 @@ class Draft:
         """Write the session; call `leave_out` before."""
         if turned := sum(image.turned for image in self.images):
             self.notes.append(f"{turned} images have an EXIF orientation, which is ignored: pixels are used as stored")
-        times = self._choose_times()
+        times, masks = self._choose_times(), self._find_masks()
         columns = ["image", "status", "path", "timestamp", "sensor_id", "device_id", "camera"]
         for image in self.images:
             values = image.path, times[image.frame], image.sensor, image.device, camera_text(image.camera)
@@ -233,8 +277,9 @@ class Draft:
         self.rows = [row | {"image": printable(row["image"]), "status": printable(row["status"])} for row in self.rows]
         table = pd.DataFrame(self.rows, columns=columns).astype({"timestamp": "Int64"})
         with write_folder(self.session) as session:
-            for image in self.images:
-                source, target = self.source(image.name), session / RAW_DATA / image.path
+            files = [(self.source(image.name), session / RAW_DATA / image.path) for image in self.images]
+            files += [(path, session / MASKS / f"{IMPORTED}{name}.png") for name, path in masks.items()]
+            for source, target in files:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 if self.placing == "copy":
                     shutil.copyfile(source, target)
@@ -284,7 +329,10 @@ class Draft:
             return str(error)
         orientation, camera = read_number(exif, ORIENTATION), image.camera
         # Other values than 1 to 8 mean nothing (COLMAP #4322: some cameras write 0).
-        image.turned, image.time_us, image.zone_us = 1 < orientation <= 8, time_taken(exif), zone_of(exif)
+        image.turned = 1 < orientation <= 8
+        self.given_times += image.time_us is not None
+        if image.time_us is None:
+            image.time_us, image.zone_us = time_taken(exif), zone_of(exif)
         (width, height), sides = size, (*size, camera.width, camera.height)
         if size == (camera.width, camera.height):
             return ""
@@ -308,14 +356,17 @@ class Draft:
             zone = ", in UTC, as its time zone changes" if in_zones else ""
             if zones and len(zones) < len(frames):
                 zone = "; only some images have a time zone, which is ignored"
-            self.notes.append(f"timestamps: camera clock, from EXIF{zone}")
+            how = "as given" if self.given_times else f"camera clock, from EXIF{zone}"
+            self.notes.append(f"timestamps: {how}")
             return taken
         why = f"some images have {'no' if len(taken) < len(frames) else 'the same'} time in EXIF"
         self.notes.append(f"timestamps: made up, one second apart in the order of the images ({why})")
         return {frame: (number + 1) * 10**6 for number, frame in enumerate(frames)}
 
 
-def start(capture: str | Path, device: str, split: str, folder: Path, placing: str) -> Draft:
+def start(
+    capture: str | Path, device: str, split: str, folder: Path, placing: str, masks: str | Path | None = None
+) -> Draft:
     """Return the draft of a new session. Raise CaptureError if it exists, ManifestError for an invalid argument."""
     if split not in SPLITS:
         raise ManifestError(f"split: unknown {split!r}. {nearest(split, SPLITS)}")
@@ -328,7 +379,7 @@ def start(capture: str | Path, device: str, split: str, folder: Path, placing: s
         raise ManifestError(f"device: found {device!r}, expected fewer letters: a session's name has 40 bytes at most.")
     if session.exists():
         raise CaptureError(f"{session} exists already. Import into another capture or device, or remove it first.")
-    return Draft(session, folder, placing)
+    return Draft(session, folder, placing, masks=None if masks is None else Path(masks))
 
 
 def write_drafts(*drafts: Draft) -> list[ImportReport]:
@@ -361,7 +412,7 @@ def require_hold_out(number: int, split: str, count: int) -> None:
 def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES, notes: list[str] | None = None) -> list[str]:
     """Return the images in and below a folder, sorted by path. Links to folders elsewhere are followed, each once.
 
-    Sessions that an import has made are skipped, and names that are not Unicode.
+    Sessions that an import has made are skipped, masks (see `images.find_mask`), and names that are not Unicode.
 
     Args:
         notes: gets a line for each kind of files that are left out.
@@ -370,7 +421,7 @@ def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES, notes:
         CaptureError: there is no image.
     """
     files, captures = walk_files(folder)
-    names = sorted((name for name in files if name.lower().endswith(suffixes)), key=Path)
+    names = sorted((name for name in files if name.lower().endswith(suffixes) and not _is_mask(name)), key=Path)
     broken = [name for name in names if printable(name) != name]
     names = [name for name in names if name not in set(broken)] if broken else names
     others = Counter(Path(name).suffix.lower() for name in files if name.lower().endswith(PHOTOGRAPHS))
@@ -419,6 +470,11 @@ def _loose(name: str) -> str:
     return stem if f"{dot}{suffix}" in (*IMAGE_SUFFIXES, *PHOTOGRAPHS) else name
 
 
+
+
+def _is_mask(name: str) -> bool:
+    path = PurePosixPath(name)
+    return MASKS in path.parts[:-1] and path.suffix == ".png" and path.stem.lower().endswith(IMAGE_SUFFIXES)
 
 
 def posed_camera(world_from_named: Floats, axes: str, unit_m: float) -> Floats:

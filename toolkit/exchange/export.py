@@ -40,7 +40,7 @@ from toolkit.manifest import nearest
 from toolkit.mapping.local_map import LocalMap
 from toolkit.results.pair import PairResults, names_of_maps
 
-NAMES = ("own", "capture")
+NAMES = ("own", "capture", "file")
 _LOCALIZE = "Run the localize stage first (python -m toolkit run MANIFEST --only localize)."
 Keypoints = Mapping[str, NDArray[np.floating]]
 
@@ -236,7 +236,8 @@ def export_poses(
     """Write the poses of a pair's queries in hloc's format, `name qw qx qy qz tx ty tz` for each image.
 
     Poses are cam_from_world in the unit of the capture; a rig has one line per camera. Queries without a pose are left
-    out. Names are complete paths, whereas hloc writes file names only. Return the number of lines.
+    out. Names are complete paths; `file`: file names only, as hloc and visuallocalization.net have them. Return the
+    number of lines.
 
     Raises:
         ArtifactError: the run has no such poses, they are of older references or of an older map, or a name contains a
@@ -284,7 +285,7 @@ def _require_names(names: str) -> None:
 
 def _exported(name: str, names: str) -> str:
     """Return the exported name of an image, given its name in the capture."""
-    return own_name(name) if names == "own" else name
+    return own_name(name) if names == "own" else name if names == "capture" else name.rpartition("/")[2]
 
 
 def _listed(name: str, names: str, path: Path) -> str:

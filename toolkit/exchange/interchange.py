@@ -10,7 +10,7 @@ import csv
 import io
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from fnmatch import fnmatch
 from pathlib import Path
@@ -51,7 +51,7 @@ _CAMERA_COLUMNS = ("model", "width", "height", "params")
 def import_colmap(
     model: str | Path, images: str | Path, capture: str | Path, device: str = "ios", split: str = "map",
     placing: str = "link", axes: str = "opencv", unit_m: float | None = None, hold_out: int = 0,
-    match_names: bool = False,
+    match_names: bool = False, masks: str | Path | None = None,
 ) -> ImportReport:  # fmt: skip
     """Make a session from a COLMAP model and its images: cameras, poses, and the rigs that have several cameras.
 
@@ -71,6 +71,7 @@ def import_colmap(
         hold_out: every `hold_out`-th frame of a map, in order of names, becomes a query with ground truth instead;
             0: none.
         match_names: take files whose names differ only in case, extension or separators.
+        masks: folder of masks, see `images.find_mask`; they are placed as the images are.
 
     Raises:
         CaptureError: no model in the folder, or a damaged one; the session exists already, or no image is left.
@@ -78,7 +79,7 @@ def import_colmap(
             or a device that cannot be part of a name.
     """
     require_convention(axes, 1.0 if unit_m is None else unit_m)
-    draft = start(capture, device, split, Path(images), placing)
+    draft = start(capture, device, split, Path(images), placing, masks)
     draft.match_names = match_names
     content = read_model(Path(model))
     draft.notes += content.notes
@@ -103,17 +104,17 @@ def import_colmap(
         if frame is not None:
             rig_name, sensor = f"{SUBSESSION}/rig_{frame.rig_id}", sensors.get((frame.rig_id, image.camera_id), sensor)
             sensor_from_rig = content.rigs[frame.rig_id].get(image.camera_id)
-            pose = frame.rig_from_world if sensor_from_rig is not None else "its camera has no pose in its rig"
-            if not isinstance(pose, str) and not isinstance(image.cam_from_world, str):
+            pose = "its camera has no pose in its rig" if sensor_from_rig is None else frame.rig_from_world
+            if not (sensor_from_rig is None or isinstance(pose, str) or isinstance(image.cam_from_world, str)):
                 moved += not np.allclose(sensor_from_rig @ pose, image.cam_from_world, rtol=1e-4, atol=1e-4)
-        unusable = "its name occurs twice in the model" if image.name in names else camera
-        unusable = unusable if isinstance(unusable, str) else pose
+        if image.name in names:
+            draft.rows.append({"image": image.name, "status": "its name occurs twice in the model"})
+        elif isinstance(camera, str) or isinstance(pose, str):
+            draft.rows.append({"image": image.name, "status": camera if isinstance(camera, str) else pose})
+        else:
+            draft.images.append(DraftImage(image.name, camera, sensor, f"{frame_id}", rig_name))
+            draft.poses[f"{frame_id}"] = invert(pose)
         names.add(image.name)
-        if isinstance(unusable, str) or isinstance(camera, str):
-            draft.rows.append({"image": image.name, "status": unusable})
-            continue
-        draft.images.append(DraftImage(image.name, camera, sensor, f"{frame_id}", rig_name))
-        draft.poses[f"{frame_id}"] = invert(unusable)
     if moved:
         draft.notes.append(f"{moved} images have another pose than their rig gives them: that of the rig is taken")
     with suppress(CaptureError):  # the model may be of images in other formats
@@ -129,6 +130,7 @@ def import_images(
     poses_are: str = "world_from_cam", camera: str | None = None, cameras: str | Path | None = None,
     placing: str = "link", axes: str = "opencv", unit_m: float | None = 1.0, truth: str | Path | None = None,
     hold_out: int = 0, match_names: bool = False, only: Sequence[str] | None = None, skip: Sequence[str] | None = None,
+    masks: str | Path | None = None,
 ) -> ImportReport:  # fmt: skip
     """Make a session from a folder of images without rigs.
 
@@ -137,7 +139,7 @@ def import_images(
 
     Args:
         images: folder; without a table, all JPEG and PNG files in and below it are imported.
-        capture, device, split, placing: as for `import_colmap`. A map needs poses.
+        capture, device, split, placing, masks: as for `import_colmap`. A map needs poses.
         table: CSV file, see the module's docstring.
         poses_are: direction of the poses in table and truth: `world_from_cam`, `cam_from_world`, or
             `rotation_of_cam_from_world`, whose positions are the camera centers, as in NVM, Bundler and the Cambridge
@@ -161,7 +163,7 @@ def import_images(
     if poses_are not in POSE_DIRECTIONS:
         raise ManifestError(f"poses_are: unknown {poses_are!r}. {nearest(poses_are, POSE_DIRECTIONS)}")
     require_convention(axes, 1.0 if unit_m is None else unit_m)
-    draft, folder = start(capture, device, split, Path(images), placing), Path(images)
+    draft, folder = start(capture, device, split, Path(images), placing, masks), Path(images)
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder of images.")
     draft.match_names = match_names
@@ -201,7 +203,7 @@ def import_images(
 
 
 def import_once(
-    images: str | Path | None, capture: str | Path, device: str, split: str, unit_m: float | None = 1.0, **options: Any
+    images: str | Path, capture: str | Path, device: str, split: str, unit_m: float | None = 1.0, **options: Any
 ) -> str:
     """Import images, unless the session was imported before from the same input. Return a message for the user.
 
@@ -211,10 +213,8 @@ def import_once(
 
     Raises:
         CaptureError: the session was imported from other input (the message names it); or as for the imports.
-        ManifestError: no folder is given, or not the folder of the transforms.json; or as for the imports.
+        ManifestError: not the folder of the transforms.json; or as for the imports.
     """
-    if images is None:
-        raise ManifestError(f"{split}_images: found None, expected the folder of your images: other inputs are given.")
     session = Path(capture) / "sessions" / f"{device}_{split}"
     inputs: dict[str, Any] = {"images": str(Path(images).resolve()), **options}
     if unit_m != 1:  # sessions of earlier versions do not record it
@@ -225,11 +225,14 @@ def import_once(
             inputs[name] = str(Path(inputs[name]).resolve())
     if inputs.get("camera") is not None and _has_cameras(table=options.get("table"), cameras=options.get("cameras")):
         inputs["camera"] = None  # the table or cameras.txt override it
-    names = list_images(Path(images), READ_SUFFIXES)
+    try:
+        names = list_images(Path(images), READ_SUFFIXES)
+    except CaptureError as error:
+        raise CaptureError(f"{split}_images: {error}") from None
     inputs["files of images"] = files_fingerprint([Path(images) / name for name in names])
-    record = session / IMPORT_RECORD
-    if not session.exists():
-        file = options.get("table")
+
+    def make() -> str:
+        file, record = options.get("table"), session / IMPORT_RECORD
         if file is not None and _is_transforms(file):
             if Path(images).resolve() != Path(file).resolve().parent:
                 raise ManifestError(f"{split}_images: found {images}, expected the folder of {file}.")
@@ -239,8 +242,23 @@ def import_once(
         else:
             report = import_images(images, capture, device, split, unit_m=unit_m, **options)
         unknown = {"unit": None} if unit_m is None else {}
-        write_text(record, json.dumps(read_json(record) | unknown | {"input": inputs}, indent=1) + "\n")
+        write_text(record, json.dumps(read_json(record) | unknown, indent=1) + "\n")
         return report.text()
+
+    return once(session, inputs, make)
+
+
+def once(session: Path, inputs: Mapping[str, Any], make: Callable[[], str]) -> str:
+    """Make a session, unless it was made before from the same inputs. Return a message for the user.
+
+    Raises:
+        CaptureError: the session was made from other inputs; names them.
+    """
+    record = session / IMPORT_RECORD
+    if not session.exists():
+        text = make()
+        write_text(record, json.dumps(read_json(record) | {"input": inputs}, indent=1) + "\n")
+        return text
     before = read_json(record).get("input", {})
     if differing := [name for name in inputs if before.get(name) != inputs[name]]:
         changes = "; ".join(

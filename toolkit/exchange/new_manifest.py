@@ -3,6 +3,7 @@
 import json
 import os
 import re
+from collections.abc import Sequence
 from itertools import dropwhile
 from pathlib import Path
 
@@ -15,12 +16,16 @@ TEMPLATE = Path(__file__).resolve().parents[2] / "data_manifests" / "my-capture.
 MAX_PROBLEMS = 10
 
 
-def new_manifest(name: str, capture: str | Path | None = None, folder: str | Path = "data_manifests") -> Path:
+def new_manifest(
+    name: str, capture: str | Path | None = None, folder: str | Path = "data_manifests",
+    thresholds: Sequence[tuple[float, float]] = (),
+) -> Path:  # fmt: skip
     """Write `<folder>/<name>.yaml` and return its path.
 
     Args:
         name: name of the manifest and of its run.
         capture: capture folder; None: keep the template's placeholder, for the user to fill in.
+        thresholds: of recall, degrees and meters; empty: those of the template.
 
     Raises:
         ManifestError: an invalid name, the file exists already, or there is no template.
@@ -42,7 +47,10 @@ def new_manifest(name: str, capture: str | Path | None = None, folder: str | Pat
         report = check_capture(capture).text(MAX_PROBLEMS)
         head += [f"# Run it: python -m toolkit run {path}", "#", "# Result of `python -m toolkit check`:"]
         head += [f"# {line}".rstrip() for line in report.splitlines()]
-        for prefix, new_line in _new_lines(Path(capture), path.parent).items():
+        changed = _new_lines(Path(capture), path.parent)
+        if thresholds:
+            changed["  thresholds: "] = f"  thresholds: {[list(one) for one in thresholds]} # degrees, meters"
+        for prefix, new_line in changed.items():
             index = next((index for index, line in enumerate(lines) if line.startswith(prefix)), None)
             if index is None:
                 raise ManifestError(f"{TEMPLATE}: no line starts with {prefix!r}. Restore the file.")

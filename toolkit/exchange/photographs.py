@@ -12,7 +12,15 @@ import pycolmap
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from toolkit.capture.images import EXIF_CAMERA, HEADER_ERRORS, ORIENTATION, exif_camera, read_header, read_number
+from toolkit.capture.images import (
+    HEADER_ERRORS,
+    ORIENTATION,
+    exif_camera,
+    exif_key,
+    find_mask,
+    read_header,
+    read_number,
+)
 from toolkit.errors import CaptureError, ImageError
 from toolkit.exchange.drafts import IMAGE_SUFFIXES, list_images
 from toolkit.files import write_atomic
@@ -34,6 +42,7 @@ class Photograph:
     path: Path  # the JPEG or PNG file
     exif: Mapping[int, Any]
     geo: tuple[float, float, float] | None  # latitude and longitude, degrees, and altitude, meters
+    mask: Path | None = None
 
     @property
     def quarter_turns(self) -> int:
@@ -41,10 +50,13 @@ class Photograph:
         return {3: 2, 6: 3, 8: 1}.get(int(read_number(self.exif, ORIENTATION)), 0)
 
 
-def gather(sources: Sequence[Path], made: Path, fps: float | None = None) -> tuple[list[Photograph], dict[str, str]]:
+def gather(
+    sources: Sequence[Path], made: Path, fps: float | None = None, masks: Path | None = None
+) -> tuple[list[Photograph], dict[str, str]]:
     """Return the photographs of files, folders and videos, and the reason for each that cannot be read, by name.
 
-    Frames of videos, and photographs in other formats than JPEG and PNG, are written to the folder `made`, once.
+    Frames of videos, and photographs in other formats than JPEG and PNG, are written to the folder `made`, once. For
+    `masks` see `images.find_mask`.
 
     Raises:
         CaptureError: a source is missing or is no image or video, or two photographs would have one name.
@@ -54,12 +66,15 @@ def gather(sources: Sequence[Path], made: Path, fps: float | None = None) -> tup
         try:
             name, path = _converted(name, source, made)
             _, exif = read_header(path)
-            photographs.append(Photograph(name, path, exif, _position(path)))
+            photographs.append(Photograph(name, path, exif, _position(path), find_mask(source, masks)))
         except ImageError as error:
             unreadable[name] = str(error)
     twice = {item.name for item in photographs}
     if len(twice) < len(photographs):
         raise CaptureError(f"{', '.join(map(str, sources))}: two photographs have one name. Rename a file or folder.")
+    if masks is not None and photographs and not any(item.mask for item in photographs):
+        name = photographs[0].name
+        raise CaptureError(f"{masks}: no mask of a photograph in it. Expected that of {name} as {name}.png.")
     return photographs, unreadable
 
 
@@ -199,7 +214,7 @@ def initial_cameras(
     keys: dict[Any, int] = {}
     numbers, cameras = list[int](), list[pycolmap.Camera]()
     for index, (item, size, folder) in enumerate(zip(photographs, sizes, folders, strict=True)):
-        tags = tuple(str(item.exif.get(tag, "")) for tag in EXIF_CAMERA)
+        tags = exif_key(item.exif)
         key = folder, size, tags, index if mixed[folder] and not any(tags) else None
         if key not in keys:
             keys[key] = len(cameras)

@@ -49,12 +49,12 @@ TOLERANCE = 1e-3  # largest deviation of R^T R from the identity, per element, t
 def import_transforms(
     path: str | Path, capture: str | Path, device: str = "ios", split: str = "map", placing: str = "link",
     axes: str = "opengl", unit_m: float | None = None, hold_out: int = 0, undo_applied: bool = False,
-    match_names: bool = False, own_split: bool = True,
+    match_names: bool = False, own_split: bool = True, masks: str | Path | None = None,
 ) -> list[ImportReport]:  # fmt: skip
     """Make a session, or a map and a query session, from a transforms.json. Images keep their `file_path` as names.
 
     Args:
-        capture, device, split, placing: as for `interchange.import_colmap`.
+        capture, device, split, placing, masks: as for `interchange.import_colmap`.
         axes: camera axes of the matrices, see `drafts.AXES`.
         unit_m: meters per unit of the poses; None: unknown, as after structure from motion. The poses are then not
             scaled, and the session records that their unit is unknown.
@@ -79,7 +79,7 @@ def import_transforms(
     held = _named(content, "val_filenames", "test_filenames")
     own_split = own_split and bool(held) and split == "map" and not hold_out
     splits = (split, "query") if hold_out or own_split else (split,)
-    drafts = [start(capture, device, name, path.parent, placing) for name in splits]
+    drafts = [start(capture, device, name, path.parent, placing, masks) for name in splits]
     frames: dict[str, _Frame] = {}
     applied = _applied(path, content)
     for number, entry in enumerate(content["frames"]):

@@ -2,14 +2,16 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from toolkit.capture.images import read_image
 from toolkit.capture.upright import turn_image, turn_points
-from toolkit.errors import ManifestError
+from toolkit.errors import ImageError, ManifestError
 from toolkit.features.rootsift import rootsift_64
 from toolkit.geometry import Ints
 from toolkit.manifest import AUTO, FeaturesSettings, checkpoint_of, nearest
@@ -149,3 +151,21 @@ def extract_turned(
     """Extract features after counter-clockwise quarter turns; return them in the images as stored."""
     upright = extractor.extract([turn_image(image, turn) for image, turn in zip(images, turns, strict=True)])
     return [features.turned(-turn) if turn else features for features, turn in zip(upright, turns, strict=True)]
+
+
+def unmasked(features: LocalFeatures, mask: Path | None) -> LocalFeatures:
+    """Return the features outside of the black pixels of an image's mask, as COLMAP does; None: all features.
+
+    Raises:
+        ImageError: the mask cannot be read, has another size than the image as stored, or is black everywhere.
+    """
+    if mask is None:
+        return features
+    pixels, (width, height) = read_image(mask, gray=True), features.image_size
+    if pixels.shape != (height, width):
+        found = f"Mask of {pixels.shape[1]} x {pixels.shape[0]} pixels"
+        raise ImageError(f"{found}, but the image has {width} x {height}: {mask}")
+    if not pixels.any():
+        raise ImageError(f"No features, as the mask of the image is black everywhere: {mask}")
+    x, y = np.clip(features.keypoints.astype(np.int64), 0, [width - 1, height - 1]).T
+    return features.take(np.flatnonzero(pixels[y, x]))

@@ -20,7 +20,7 @@ from tqdm.auto import tqdm
 from toolkit.capture import Session
 from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.errors import ArtifactError, ImageError
-from toolkit.features.features import KINDS, Extractor, LocalFeatures, extract_turned
+from toolkit.features.features import KINDS, Extractor, LocalFeatures, extract_turned, unmasked
 from toolkit.features.matching import Matcher, PairMatches
 from toolkit.features.sift import SiftExtractor
 from toolkit.files import files_fingerprint, fingerprint, link_folder
@@ -219,10 +219,10 @@ class OnDemandFeatures:
 
 
 def _made_from(session: Session, row: int, turns: int) -> str:
-    """Return a fingerprint of an image: its file's name, size and time of change, its camera's size, and its turns."""
+    """Return a fingerprint of an image: its files' names, sizes and times of change, camera size, and turns."""
     camera = session.camera(session.images["sensor_id"].iloc[row])
-    turned = [turns] if turns else []
-    return fingerprint([files_fingerprint([session.image_path(row)]), camera.width, camera.height, *turned])
+    turned, files = [turns] if turns else [], [session.image_path(row), *session.mask_paths([row])]
+    return fingerprint([files_fingerprint(files), camera.width, camera.height, *turned])
 
 
 def _extract(
@@ -242,21 +242,27 @@ def _extract(
             return f"Image of {image.shape[1]} x {image.shape[0]} pixels, but {said}"
         return image
 
+    def without_masked(row: int, features: LocalFeatures) -> LocalFeatures | str:
+        try:
+            return unmasked(features, session.mask_path(row))
+        except ImageError as error:
+            return str(error)
+
     def read_and_extract(item: tuple[int, int]) -> LocalFeatures | str:
         row, turns = item
         image = read(row)
-        return image if isinstance(image, str) else extract_turned(extractor, [image], [turns])[0]
+        return image if isinstance(image, str) else without_masked(row, extract_turned(extractor, [image], [turns])[0])
 
     if extractor.threaded:
         yield from prefetch(read_and_extract, images, workers)
         return
     pictures = prefetch(read, (row for row, _ in images), workers, ahead=2 * extractor.batch_size)
-    turned = zip(pictures, (turns for _, turns in images), strict=True)
+    turned = zip(pictures, images, strict=True)
     while batch := list(islice(turned, extractor.batch_size)):
-        readable = [(image, turns) for image, turns in batch if not isinstance(image, str)]
+        readable = [(image, turns) for image, (_, turns) in batch if not isinstance(image, str)]
         features = iter(extract_turned(extractor, *zip(*readable, strict=True)) if readable else [])
-        for image, _ in batch:
-            yield image if isinstance(image, str) else next(features)
+        for image, (row, _) in batch:
+            yield image if isinstance(image, str) else without_masked(row, next(features))
 
 
 def matches_path(out: str | Path, session0: str, session1: str, made_by: Mapping[str, Any]) -> Path:

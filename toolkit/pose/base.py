@@ -14,7 +14,7 @@ from toolkit import geometry
 from toolkit.capture.cameras import camera_text
 from toolkit.capture.images import pixels_of, stored_size, thumbnails
 from toolkit.errors import CameraError
-from toolkit.features.features import KINDS, LocalFeatures, extract_turned
+from toolkit.features.features import KINDS, LocalFeatures, extract_turned, unmasked
 from toolkit.features.matching import AnyMethod, PairMatches
 from toolkit.geometry import Floats, Ints
 from toolkit.pose.result import QueryResult, Status
@@ -42,6 +42,8 @@ class View:
     turns: int = 0
     """Counter-clockwise quarter turns that make the image upright, see `capture.upright`. Networks get the turned
     image; their outputs are turned back to the stored image."""
+    mask: Path | None = None
+    """File that is black where to extract no features, of the image's size; None: no mask."""
     _decoded: dict[tuple[bool, int | None], NDArray[np.uint8]] = field(default_factory=dict, repr=False, compare=False)
 
     def read(self, color: bool, least_side: int | None = None) -> NDArray[np.uint8]:
@@ -63,10 +65,10 @@ class View:
         return self._decoded[color, least_side]
 
     def extract(self, method: AnyMethod) -> LocalFeatures:
-        """Return the local features of one kind; see `read` for the errors."""
+        """Return the local features of one kind; see `read` and `unmasked` for the errors."""
         turns = self.turns if KINDS[method.name].upright else 0
         (features,) = extract_turned(method.extractor, [self.read(method.extractor.color)], [turns])
-        return features
+        return unmasked(features, self.mask)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from toolkit.capture.cameras import camera_text, parse_camera
-from toolkit.capture.images import exif_camera, stored_size
+from toolkit.capture.images import exif_camera, exif_key, find_mask, read_header, stored_size
 from toolkit.errors import CameraError, ImageError
 from toolkit.pose.base import Query, View
 
@@ -30,7 +30,8 @@ def query_from(
     """Return a query of one image, or of those that the cameras of a rig took at one instant.
 
     Args:
-        image: a file, or pixels as `pixels_from` takes them; for a rig, a sequence of C images.
+        image: a file, which may have a mask, see `find_mask`; or pixels as `pixels_from` takes them; for a rig, a
+            sequence of C images.
         camera: intrinsics, with the size of the image; for a rig, a sequence of C cameras.
         rig_from_cams: (C, 4, 4), for a rig.
         turns: for each image, the counter-clockwise quarter turns that bring gravity down; None: all are upright.
@@ -53,7 +54,9 @@ def query_from(
         )
     pixels = [Path(one) if isinstance(one, str | Path) else pixels_from(one) for one in images]
     numbered = enumerate(zip(pixels, cameras, quarter_turns, strict=True), start=1)
-    return Query([View(f"image {k}", image, one, False, turn) for k, (image, one, turn) in numbered], poses)
+    masks = [find_mask(one) if isinstance(one, Path) else None for one in pixels]
+    views = [View(f"image {k}", image, one, False, turn, masks[k - 1]) for k, (image, one, turn) in numbered]
+    return Query(views, poses)
 
 
 def pixels_from(image: Any) -> NDArray[np.uint8]:
@@ -115,6 +118,12 @@ def guessed_camera(image: Image, known: Sequence[pycolmap.Camera]) -> tuple[pyco
     params = [FOCAL_PRIOR * max(width, height), width / 2, height / 2]
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
     return camera, f"a guess, {FOCAL_PRIOR:g} times the longer side"
+
+
+def camera_key(image: Image, camera: pycolmap.Camera) -> tuple[Any, ...]:
+    """Return what images of one camera have in common: size, and what EXIF says of the camera."""
+    exif = read_header(Path(image))[1] if isinstance(image, str | Path) else {}
+    return camera.width, camera.height, *exif_key(exif)
 
 
 def with_focal(camera: pycolmap.Camera, focal_px: float) -> pycolmap.Camera:

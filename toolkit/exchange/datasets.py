@@ -1,0 +1,370 @@
+"""Import data sets of the field, in the layout in which they are published, with their own split, truth and thresholds.
+
+Layouts: 7-Scenes (J. Shotton et al., CVPR 2013), 12-Scenes (J. Valentin et al., 3DV 2016), Cambridge Landmarks (A.
+Kendall et al., ICCV 2015), Aachen Day-Night v1.1 (Z. Zhang et al., IJCV 2021), ETH3D (T. Schöps et al., CVPR 2017),
+TUM RGB-D (J. Sturm et al., IROS 2012), KITTI odometry (A. Geiger et al., CVPR 2012), EuRoC MAV (M. Burri et al., IJRR
+2016).
+"""
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import yaml
+
+from toolkit.capture import parse_camera
+from toolkit.capture.images import stored_size
+from toolkit.errors import CaptureError, ImageError, ManifestError
+from toolkit.exchange.colmap_model import read_model
+from toolkit.exchange.drafts import Draft, ImportReport, start, write_drafts
+from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
+from toolkit.manifest import nearest
+
+HOLD_OUT = 8
+"""Every such photograph becomes a query, in data sets without a split."""
+MAX_OFFSET_S = 0.02
+"""Largest time between a photograph and the pose that is taken for it, seconds."""
+_SEVEN_SCENES = (525.0, 525.0, 320.0, 240.0)  # of the color camera, as usual for this data set; none is published
+_TWELVE_SCENES = (572.0, 572.0, 320.0, 240.0)  # at 640 x 480, where a scene has no info.txt
+_TUM = {
+    "freiburg1": "FULL_OPENCV, 640, 480, 517.3, 516.5, 318.6, 255.3, .2624, -.9531, -.0054, .0026, 1.1633, 0, 0, 0",
+    "freiburg2": "FULL_OPENCV, 640, 480, 520.9, 521.0, 325.1, 249.7, .2312, -.7849, -.0033, -.0001, .9172, 0, 0, 0",
+    "freiburg3": "PINHOLE, 640, 480, 535.4, 539.2, 320.1, 247.6",
+}
+"""Intrinsics of the color cameras, from the data set's page."""
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """An image of a data set."""
+
+    name: str
+    """Path in the folder of the images."""
+    split: str
+    """`map` or `query`; empty if the data set has no split."""
+    camera: pycolmap.Camera | str
+    """Intrinsics, or why there are none."""
+    pose: Floats | str | None
+    """world_from_cam (4, 4), meters; None: not published; or why there is none."""
+    time_us: int | None = None
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a data set is read."""
+
+    read: Callable[[Path], tuple[Path, list[Photograph]]]
+    """Takes the folder of a scene; returns the folder of its images, and the images."""
+    thresholds: Sequence[tuple[float, float]]
+    """Of recall, as usual for the data set: degrees, meters."""
+    example: str
+    """A file that tells a scene's folder."""
+
+
+def import_dataset(
+    kind: str, path: str | Path, capture: str | Path, scene: str | None = None, device: str = "ios",
+    every: int = 1, hold_out: int = HOLD_OUT, placing: str = "link",
+) -> list[ImportReport]:  # fmt: skip
+    """Make a map and a query session from a data set of the field.
+
+    Args:
+        kind: one of `LAYOUTS`.
+        path: folder of the data set, or of one of its scenes.
+        capture, device, placing: as for `interchange.import_colmap`.
+        scene: folder of the scene in `path`, such as `chess`; None: `path` is the scene.
+        every: take only every such image of each folder.
+        hold_out: in data sets without a split, every such image becomes a query.
+
+    Returns:
+        The reports of the map and of the queries.
+
+    Raises:
+        ManifestError: an unknown kind, scene, device or placing.
+        CaptureError: a file of the data set is missing or malformed (names file and line); a session exists already,
+            or has no usable image.
+    """
+    if kind not in LAYOUTS:
+        raise ManifestError(f"dataset: unknown {kind!r}. {nearest(kind, LAYOUTS)}")
+    if every < 1 or hold_out < 2:
+        raise ManifestError(f"every, hold-out: found {every}, {hold_out}, expected at least 1 and 2.")
+    layout, folder = LAYOUTS[kind], Path(path) / (scene or "")
+    if not any(folder.glob(layout.example)):
+        scenes = sorted({match.parents[layout.example.count("/")] for match in Path(path).rglob(layout.example)})
+        known = [one.relative_to(path).as_posix() for one in scenes]
+        found = f"no {layout.example}" if folder.is_dir() else "no such folder"
+        do = f"Give --scene: {nearest(scene or '', known)}" if known else "Give the unpacked folder of the data set."
+        raise CaptureError.at(folder, found, "a scene in the layout in which it is published", do)
+    root, images = layout.read(folder)
+    drafts = {split: start(capture, device, split, root, placing) for split in ("map", "query")}
+    numbers, taken = Counter[str](), 0
+    for image in sorted(images, key=lambda image: image.name):
+        number = numbers[parent := str(Path(image.name).parent)]
+        numbers[parent] += 1
+        if number % every:
+            continue
+        taken += 1
+        split = image.split or ("query" if taken % hold_out == 0 else "map")
+        _add(drafts[split], image)
+    if not drafts["query"].images and not drafts["query"].rows:
+        del drafts["query"]
+    return write_drafts(*drafts.values())
+
+
+def _add(draft: Draft, image: Photograph) -> None:
+    problem = next((why for why in (image.camera, image.pose) if isinstance(why, str)), None)
+    if problem is not None or isinstance(image.camera, str):
+        draft.rows.append({"image": image.name, "status": problem})
+        return
+    assert not isinstance(image.pose, str)
+    draft.add(image.name, image.camera, image.pose, image.time_us)
+
+
+# Reading
+
+
+def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Return place and words of the lines of a text file that are neither empty nor comments."""
+    try:
+        text = path.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read ({error.strerror}). It is part of the data set.") from None
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.strip() and not line.startswith("#"):
+            yield f"{path}, line {number}", line.replace(",", " ").split()
+
+
+def _numbers(where: str, words: Sequence[str], count: int) -> Floats:
+    try:
+        values = np.array([float(word) for word in words[:count]])
+        if len(values) == count:
+            return values
+    except ValueError:
+        pass
+    raise CaptureError(f"{where}: found {' '.join(words)[:80]!r}, expected {count} numbers.")
+
+
+def _camera(where: object, params: str) -> pycolmap.Camera:
+    try:
+        return parse_camera("camera", params)
+    except ValueError as error:
+        raise CaptureError(f"{where}: {error}") from None
+
+
+def _matrix(path: Path) -> Floats | str:
+    """Return a pose (4, 4) from a file of four lines, or why there is none: tracking was lost."""
+    try:
+        rows = np.array([_numbers(where, words, 4) for where, words in _lines(path)])
+    except CaptureError as error:
+        return str(error)
+    is_pose = rows.shape == (4, 4) and np.isfinite(rows).all()
+    return rows if is_pose and abs(np.linalg.det(rows[:3, :3]) - 1) < 0.01 else f"{path.name}: no pose in it"
+
+
+def _size(path: Path) -> tuple[int, int] | str:
+    try:
+        return stored_size(path)
+    except ImageError as error:
+        return str(error)
+
+
+def _nearest_pose(times_s: Floats, poses: Floats, time_s: float) -> Floats | str:
+    """Return the pose of the sorted `times_s` that is nearest to a time."""
+    at = int(np.searchsorted(times_s, time_s))
+    near = [k for k in (at - 1, at) if 0 <= k < len(times_s)]
+    best = min(near, key=lambda k: abs(times_s[k] - time_s), default=None)
+    if best is None or abs(times_s[best] - time_s) > MAX_OFFSET_S:
+        return f"no true pose within {MAX_OFFSET_S:g} s"
+    return np.asarray(poses[best])
+
+
+def _first(paths: Iterable[Path], folder: Path, expected: str) -> Path:
+    path = next(iter(sorted(paths)), None)
+    if path is None:
+        raise CaptureError(f"{folder}: no {expected}. It is part of the data set: unpack all of it.")
+    return path
+
+
+# The layouts
+
+
+def _seven_scenes(folder: Path) -> tuple[Path, list[Photograph]]:
+    camera = _camera(folder, ", ".join(map(str, ("PINHOLE", 640, 480, *_SEVEN_SCENES))))
+    images = []
+    for file, split in (("TrainSplit.txt", "map"), ("TestSplit.txt", "query")):
+        for where, (word, *_) in _lines(folder / file):
+            number = re.search(r"\d+$", word)
+            if number is None:
+                raise CaptureError(f"{where}: found {word!r}, expected a sequence, such as sequence1.")
+            recording = folder / f"seq-{int(number[0]):02d}"
+            if not recording.is_dir():
+                raise CaptureError(f"{recording}: no such folder. Unpack {recording.name}.zip there.")
+            images += [
+                Photograph(path.relative_to(folder).as_posix(), split, camera, _matrix(_beside(path, "pose.txt")))
+                for path in recording.glob("*.color.png")
+            ]
+    return folder, images
+
+
+def _beside(path: Path, suffix: str) -> Path:
+    """Return `frame-000000.<suffix>` beside `frame-000000.color.png`."""
+    return path.with_name(f"{path.name.split('.')[0]}.{suffix}")
+
+
+def _twelve_scenes(folder: Path) -> tuple[Path, list[Photograph]]:
+    first = _first((folder / "data").glob("*.color.jpg"), folder, "data/*.color.jpg")
+    size = _size(first)
+    if isinstance(size, str):
+        raise CaptureError(f"{first}: {size}.")
+    fx, fy, cx, cy = np.array(_TWELVE_SCENES) * size[0] / 640
+    for where, words in _lines(folder / "info.txt") if (folder / "info.txt").is_file() else ():
+        if words[0] == "m_calibrationColorIntrinsic":
+            fx, _, cx, _, _, fy, cy = _numbers(where, words[2:], 7)
+    camera = _camera(folder / "info.txt", f"PINHOLE, {size[0]}, {size[1]}, {fx}, {fy}, {cx}, {cy}")
+    # The first sequence is for tests: `sequence0 [frames=357]  [start=0 ; end=356]`.
+    ranges = [words for _, words in _lines(folder / "split.txt") if words[0].startswith("sequence")]
+    found = re.search(r"start\s*=\s*(\d+).*?end\s*=\s*(\d+)", " ".join(ranges[0])) if ranges else None
+    if found is None:
+        raise CaptureError(f"{folder / 'split.txt'}: expected `sequence0 ... [start=0 ; end=356]`.")
+    tested, images = range(int(found[1]), int(found[2]) + 1), []
+    for path in (folder / "data").glob("*.color.jpg"):
+        split = "query" if int(re.sub(r"\D", "", path.name.split(".")[0]) or -1) in tested else "map"
+        name = path.relative_to(folder).as_posix()
+        images.append(Photograph(name, split, camera, _matrix(_beside(path, "pose.txt"))))
+    return folder, images
+
+
+def _cambridge(folder: Path) -> tuple[Path, list[Photograph]]:
+    """Read the lists of training and test images. Focal lengths are those of the structure from motion, if it is there.
+
+    The lists have the camera's center, and the rotation of cam_from_world.
+    """
+    focals = dict[str, float]()
+    if (folder / "reconstruction.nvm").is_file():
+        for _, words in _lines(folder / "reconstruction.nvm"):
+            if len(words) == 11:
+                focals[Path(words[0]).with_suffix("").as_posix()] = float(words[1])
+            elif len(words) == 1 and focals:
+                break  # points follow
+    usual, images, sizes = float(np.median([*focals.values()])) if focals else np.nan, [], dict[str, Any]()
+    for file, split in (("dataset_train.txt", "map"), ("dataset_test.txt", "query")):
+        for where, (name, *words) in _lines(folder / file):
+            if len(words) != 7 or not re.search(r"\.\w+$", name):
+                continue  # the header
+            center, quaternion = np.split(_numbers(where, words, 7), [3])
+            rotation = pose_from_qt([*quaternion / np.linalg.norm(quaternion), 0, 0, 0])[:3, :3].T
+            size = sizes[name] = _size(folder / name)
+            camera: pycolmap.Camera | str = size if isinstance(size, str) else ""
+            if not isinstance(size, str):
+                focal = focals.get(Path(name).with_suffix("").as_posix(), usual)
+                focal = focal if np.isfinite(focal) else 1670.0 * max(size) / 1920  # that of the phone, as often used
+                camera = _camera(where, f"SIMPLE_PINHOLE, {size[0]}, {size[1]}, {focal}, {size[0] / 2}, {size[1] / 2}")
+            images.append(Photograph(name, split, camera, make_pose(rotation, center)))
+    return folder, images
+
+
+def _aachen(folder: Path) -> tuple[Path, list[Photograph]]:
+    model = read_model(_first(folder.glob("3D-models/**/images.bin"), folder, "3D-models/*/images.bin").parent)
+    choices = (folder / "images_upright", folder / "images" / "images_upright")
+    root = _first(filter(Path.is_dir, choices), folder, "images_upright")
+    images = []
+    for image in model.images.values():
+        camera, pose = model.cameras.get(image.camera_id, "its camera is not in the model"), image.cam_from_world
+        images.append(Photograph(image.name, "map", camera, pose if isinstance(pose, str) else invert(pose)))
+    for path in sorted(folder.glob("queries/*_with_intrinsics.txt")):
+        for where, (name, *words) in _lines(path):
+            images.append(Photograph(name, "query", _camera(where, ", ".join(words)), None))
+    return root, images
+
+
+def _eth3d(folder: Path) -> tuple[Path, list[Photograph]]:
+    model = read_model(folder / "dslr_calibration_undistorted")
+    images = []
+    for image in model.images.values():
+        camera, pose = model.cameras.get(image.camera_id, "its camera is not in the model"), image.cam_from_world
+        images.append(Photograph(image.name, "", camera, pose if isinstance(pose, str) else invert(pose)))
+    return folder / "images", images
+
+
+def _tum(folder: Path) -> tuple[Path, list[Photograph]]:
+    kind = next((name for name in _TUM if name in folder.resolve().name), None)
+    if kind is None:
+        expected = f"a name with {', '.join(_TUM)}, which tells the camera"
+        raise CaptureError.at(folder, folder.name, expected, "Name it as published.")
+    camera = _camera(folder, _TUM[kind])
+    rows = np.array([_numbers(where, words, 8) for where, words in _lines(folder / "groundtruth.txt")])
+    rows = rows[np.argsort(rows[:, 0])]
+    poses = pose_from_qt(rows[:, [7, 4, 5, 6, 1, 2, 3]])
+    images = []
+    for where, words in _lines(folder / "rgb.txt"):
+        time_s = float(_numbers(where, words, 1)[0])
+        pose = _nearest_pose(rows[:, 0], poses, time_s)
+        images.append(Photograph(words[1], "", camera, pose, round(time_s * 1e6)))
+    return folder, images
+
+
+def _kitti(folder: Path) -> tuple[Path, list[Photograph]]:
+    """Read a sequence, `sequences/<NN>`, with its poses in `poses/<NN>.txt`: world_from_cam of the left gray camera."""
+    truth = folder.parents[1] / "poses" / f"{folder.resolve().name}.txt"
+    poses = [_numbers(where, words, 12).reshape(3, 4) for where, words in _lines(truth)]
+    times = [float(words[0]) for _, words in _lines(folder / "times.txt")]
+    number = 2 if (folder / "image_2").is_dir() else 0  # left color, or left gray
+    projections = {words[0].rstrip(":"): (where, words[1:]) for where, words in _lines(folder / "calib.txt")}
+    if f"P{number}" not in projections:
+        raise CaptureError(f"{folder / 'calib.txt'}: expected a line P{number}: and 12 numbers.")
+    projection = _numbers(*projections[f"P{number}"], 12).reshape(3, 4)
+    cam_from_gray = make_pose(np.eye(3), np.linalg.solve(projection[:, :3], projection[:, 3]))
+    files = sorted((folder / f"image_{number}").glob("*.png"))
+    size = _size(files[0]) if files else "no image"
+    if isinstance(size, str):
+        raise CaptureError(f"{folder / f'image_{number}'}: {size}.")
+    fx, fy, cx, cy = projection[0, 0], projection[1, 1], projection[0, 2], projection[1, 2]
+    camera = _camera(folder / "calib.txt", f"PINHOLE, {size[0]}, {size[1]}, {fx}, {fy}, {cx}, {cy}")
+    images = []
+    for file in files:
+        row = int(file.stem)
+        known = row < min(len(poses), len(times))
+        pose = make_pose(poses[row][:, :3], poses[row][:, 3]) @ invert(cam_from_gray) if known else f"not in {truth}"
+        name, time_us = file.relative_to(folder).as_posix(), round(times[row] * 1e6) if known else None
+        images.append(Photograph(name, "", camera, pose, time_us))
+    return folder, images
+
+
+def _euroc(folder: Path) -> tuple[Path, list[Photograph]]:
+    """Read the left camera of a recording, with the true poses of the vehicle's body."""
+    cam0 = folder / "mav0" / "cam0"
+    try:
+        sensor = yaml.safe_load((cam0 / "sensor.yaml").read_text(encoding="utf-8"))
+        body_from_cam = np.array(sensor["T_BS"]["data"], float).reshape(4, 4)
+        values = [*sensor["resolution"], *sensor["intrinsics"], *sensor["distortion_coefficients"]]
+    except (OSError, KeyError, TypeError, ValueError, yaml.YAMLError) as error:
+        keys = "T_BS, resolution, intrinsics, distortion_coefficients"
+        raise CaptureError(f"{cam0 / 'sensor.yaml'}: cannot be read ({error}). Expected {keys}.") from None
+    camera = _camera(cam0 / "sensor.yaml", ", ".join(map(str, ("OPENCV", *values))))
+    truth = folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    rows = [(int(words[0]), _numbers(where, words[1:], 7)) for where, words in _lines(truth)]
+    times_s = np.array([time_ns / 1e9 for time_ns, _ in rows])
+    states = np.array([state for _, state in rows]).reshape(-1, 7)
+    poses = pose_from_qt(states[:, [3, 4, 5, 6, 0, 1, 2]]) @ body_from_cam
+    images = []
+    for _, words in _lines(cam0 / "data.csv"):
+        time_ns = int(words[0])
+        pose = _nearest_pose(times_s, poses, time_ns / 1e9)
+        images.append(Photograph(f"data/{words[1]}", "", camera, pose, time_ns // 1000))
+    return cam0, images
+
+
+LAYOUTS = {
+    "7scenes": Layout(_seven_scenes, [(5.0, 0.05)], "TrainSplit.txt"),
+    "12scenes": Layout(_twelve_scenes, [(5.0, 0.05)], "split.txt"),
+    "cambridge": Layout(_cambridge, [(5.0, 0.25), (5.0, 0.5)], "dataset_train.txt"),
+    "aachen": Layout(_aachen, [(2.0, 0.25), (5.0, 0.5), (10.0, 5.0)], "3D-models"),
+    "eth3d": Layout(_eth3d, [(1.0, 0.05), (5.0, 0.25)], "dslr_calibration_undistorted"),
+    "tum": Layout(_tum, [(1.0, 0.05), (5.0, 0.25)], "groundtruth.txt"),
+    "kitti": Layout(_kitti, [(1.0, 0.25), (2.0, 0.5)], "calib.txt"),
+    "euroc": Layout(_euroc, [(1.0, 0.1), (5.0, 0.5)], "mav0"),
+}
