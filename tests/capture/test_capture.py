@@ -478,9 +478,9 @@ def test_keyframe_lists(session: Session) -> None:
 def test_depth_maps(session: Session, tmp_path: Path) -> None:
     assert session.depths is not None
     assert session.depths.to_numpy().tolist() == [[10, "s/depth", "s/d/10.png"]]
-    depth = np.array([[0, 1.5], [70, np.nan], [-1, 65.535]], np.float32)
+    depth = np.array([[0, 1.5], [70, np.nan], [-1, 65.534]], np.float32)
     write_depth(tmp_path / "d.png", depth)
-    np.testing.assert_array_equal(read_depth(tmp_path / "d.png"), np.float32([[0, 1.5], [0, 0], [0, 65.535]]))
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.png"), np.float32([[0, 1.5], [0, 0], [0, 65.534]]))
     with pytest.raises(CaptureError, match="Depth map"):
         read_depth(tmp_path / "none.png")
     (tmp_path / "bad.png").write_bytes(b"no image")

@@ -525,6 +525,26 @@ def test_photographs_of_200_megapixels_are_imported(tmp_path: Path, recwarn: pyt
     assert not recwarn.list
 
 
+def test_time_zones_that_change_are_applied(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    save(photos / "a.jpg", time="2026:10:25 02:10:00", tags={0x9011: "+02:00"})
+    save(photos / "b.jpg", time="2026:10:25 02:05:00", tags={0x9011: "+01:00"})  # an hour later, less 5 minutes
+    report = import_images(photos, tmp_path / "PLACE", camera=CAMERA)
+    times = report.images.set_index("image")["timestamp"]
+    assert times["b.jpg"] - times["a.jpg"] == 55 * 60 * 10**6
+    assert any("time zone" in note for note in report.notes)
+    save(photos / "b.jpg", time="2026:10:25 02:15:00", tags={0x9011: "+02:00"})
+    report = import_images(photos, tmp_path / "SAME", camera=CAMERA)
+    assert report.images.set_index("image")["timestamp"]["a.jpg"] == times["a.jpg"] + 2 * 3600 * 10**6, "the clock's"
+
+
+@pytest.mark.parametrize("orientation", [0, 9, 65535])
+def test_an_orientation_that_means_nothing_is_ignored(orientation: int, tmp_path: Path) -> None:
+    save(tmp_path / "photos" / "a.jpg", tags={0x0112: orientation})
+    report = import_images(tmp_path / "photos", tmp_path / "PLACE", camera=CAMERA)
+    assert not any("orientation" in note for note in report.notes)
+
+
 def test_times_are_those_of_the_camera_where_all_have_one(tmp_path: Path) -> None:
     for second in (7, 5):
         save(tmp_path / "photos" / f"{second}.jpg", tags={0x9291: "25"}, time=f"2024:05:01 10:00:{second:02d}")

@@ -34,6 +34,7 @@ from toolkit.capture.images import (
     read_number,
     stored_size,
     time_taken,
+    zone_of,
 )
 from toolkit.capture.names import EXPECTED_NAME, has_long_part, is_bad_name, note_linked_here
 from toolkit.errors import CaptureError, ImageError, ManifestError
@@ -92,6 +93,7 @@ class DraftImage:
     frame: str  # images with the same frame were taken at the same time
     rig: str | None = None
     time_us: int | None = None
+    zone_us: int | None = None  # offset of the camera's clock from UTC
     turned: bool = False  # whether the EXIF orientation says to rotate the image
 
     @property
@@ -326,9 +328,11 @@ class Draft:
         except ImageError as error:
             return str(error)
         orientation, camera = read_number(exif, ORIENTATION), image.camera
-        image.turned = orientation > 1
+        # Other values than 1 to 8 mean nothing (COLMAP #4322: some cameras write 0).
+        image.turned = 1 < orientation <= 8
         self.given_times += image.time_us is not None
-        image.time_us = time_taken(exif) if image.time_us is None else image.time_us
+        if image.time_us is None:
+            image.time_us, image.zone_us = time_taken(exif), zone_of(exif)
         (width, height), sides = size, (*size, camera.width, camera.height)
         if size == (camera.width, camera.height):
             return ""
@@ -336,7 +340,7 @@ class Draft:
         if abs(width * camera.height - height * camera.width) <= max(sides) / 2:  # equal ratio up to rounding
             factor = width / camera.width
             problem += f"; use images of the camera's size, or multiply its intrinsics by {factor:.6g}"
-        if orientation > 4 and size == (camera.height, camera.width):
+        if 4 < orientation <= 8 and size == (camera.height, camera.width):
             problem += "; the camera fits the rotated image: rotate the pixels and remove the EXIF orientation"
         return problem
 
@@ -344,8 +348,16 @@ class Draft:
         """Return the timestamp of each frame, microseconds: from EXIF if all frames have different times there."""
         frames = list(dict.fromkeys(image.frame for image in self.images))
         taken = {image.frame: image.time_us for image in reversed(self.images) if image.time_us is not None}
+        zones = {image.frame: image.zone_us for image in reversed(self.images) if image.zone_us is not None}
+        in_zones = len(zones) == len(frames) and len(set(zones.values())) > 1  # a journey, or daylight saving ended
+        if in_zones:
+            taken = {frame: time - zones[frame] for frame, time in taken.items()}
         if len(taken) == len(frames) == len(set(taken.values())):
-            self.notes.append(f"timestamps: {'as given' if self.given_times else 'camera clock, from EXIF'}")
+            zone = ", in UTC, as its time zone changes" if in_zones else ""
+            if zones and len(zones) < len(frames):
+                zone = "; only some images have a time zone, which is ignored"
+            how = "as given" if self.given_times else f"camera clock, from EXIF{zone}"
+            self.notes.append(f"timestamps: {how}")
             return taken
         why = f"some images have {'no' if len(taken) < len(frames) else 'the same'} time in EXIF"
         self.notes.append(f"timestamps: made up, one second apart in the order of the images ({why})")
