@@ -350,7 +350,7 @@ def test_line_numbers_hold_in_a_long_file(tmp_path: Path) -> None:
 def test_every_camera_model_of_colmap_opens(tmp_path: Path) -> None:
     import pycolmap
 
-    models = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+    models = set(pycolmap.CameraModelId.__members__) - {"INVALID", "EQUIRECTANGULAR"}
     cameras = {name: pycolmap.Camera.create_from_model_name(0, name, 50.0, 64, 48) for name in models}
     sensors = [
         (name, "", "camera", name, 64, 48, *(camera.params + 0.125).tolist()) for name, camera in cameras.items()

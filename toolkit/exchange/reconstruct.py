@@ -353,7 +353,8 @@ def reconstruct(
     folder = Path(capture) / FOLDER
     splits = ("map", "query") if hold_out else ("map",)
     drafts = [start(capture, device, split, folder, placing) for split in splits]
-    photographs, unreadable = gather(list(map(Path, sources)), folder / "images", fps, masks and Path(masks))
+    masks = None if masks is None else Path(masks)
+    photographs, unreadable = gather(list(map(Path, sources)), folder / "images", fps, masks)
     known = read_positions(Path(positions)) if positions is not None else None
     given = None
     if camera is not None:
