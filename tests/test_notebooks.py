@@ -185,7 +185,7 @@ def test_a_wrong_parameter_is_named_as_in_its_cell(name: str) -> None:
         ("localize", {"features": ["sift"], "matcher": "mutuel"}, r"^matcher: .*'mutuel'. Did you mean 'mutual'"),
         ("localize", {"settings": {"pnp": {"min_inliers": "x"}}}, r"^settings: pnp\.min_inliers: found 'x'"),
         ("embed", {"device": 3}, r"^device: found 3\. .* a valid list or a valid string\. Meaning: one of"),
-        ("own_images", {"poses_are": "cam"}, r"^poses_are: found 'cam'\. .*Known: cam_from_world, world_from_cam"),
+        ("own_images", {"poses_are": "cam"}, r"^poses_are: found 'cam'\. .*Known: cam_from_world, rotation_of"),
         ("own_images", {"map_images": 3}, r"^map_images: found 3\. .* Meaning: folder of your map images"),
     ],
 )

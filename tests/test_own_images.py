@@ -16,7 +16,7 @@ from toolkit.errors import CaptureError, ManifestError, StageError
 from toolkit.exchange.interchange import import_images, import_once
 from toolkit.figures.explore import list_poses
 from toolkit.geometry import make_pose
-from toolkit.notebook import NOTEBOOKS, notebook_parameters, own_folder
+from toolkit.notebook import NOTEBOOKS, check_values, notebook_parameters, own_folder
 from toolkit.pipeline import execute
 
 PATH = NOTEBOOKS / "00_own_images.ipynb"
@@ -70,8 +70,8 @@ def test_other_input_is_named_and_never_gets_an_earlier_result(tmp_path: Path) -
     with pytest.raises(CaptureError, match="files of images: have changed"):
         again(tmp_path / "a")
     assert session.stat().st_mtime_ns == before
-    with pytest.raises(ManifestError, match="query_images: found None"):
-        import_once(None, place, "ios", "query")
+    with pytest.raises(CaptureError, match=r"^query_images: .*no image"):
+        import_once(tmp_path / "none", place, "ios", "query")
 
 
 def test_a_camera_given_for_others_changes_nothing(tmp_path: Path) -> None:
@@ -127,6 +127,47 @@ def test_poses_are_listed_with_the_names_of_images(tmp_path: Path) -> None:
     assert table.iloc[1][["tx", "qw"]].isna().all()
 
 
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({"map_table": "HERE"}, "map_table: found .*, which has no effect without map_images"),
+        ({"query_table": "HERE", "photographs": "HERE"}, "query_table: .* no effect without query_images"),
+        ({"camera": "PINHOLE, 1, 1"}, "camera: .* no effect without"),
+        ({"unit_m": None, "photographs": "HERE"}, "unit_m: found None, which has no effect without"),
+        ({"hold_out": 4}, "hold_out: .* no effect without photographs"),
+        ({"hold_out": 4, "photographs": "HERE", "query_images": "HERE"}, "hold_out: .* no effect with query_images"),
+        ({"hold_out": 1, "photographs": "HERE"}, "hold_out: found 1, expected 2"),
+        ({"photographs": "HERE", "map_images": "HERE"}, "photographs: .* no effect with map_images"),
+        ({"sessions_root": "HERE", "photographs": "HERE"}, "sessions_root: .* no effect with photographs"),
+        ({"map_images": "HERE/none", "map_table": "HERE"}, "map_images: found '.*/none', which does not exist"),
+        ({"map_images": "HERE", "query_images": "HERE"}, "map_table: found None, but a map needs poses"),
+        ({"map_images": "HERE", "map_table": "HERE"}, "query_images: found None"),
+        ({"query_images": "HERE"}, "map_images: found None"),
+    ],
+)
+def test_a_parameter_without_effect_is_refused_by_its_name(given: dict[str, Any], named: str, tmp_path: Path) -> None:
+    values = {name: str(value).replace("HERE", str(tmp_path)) if isinstance(value, str) else value
+              for name, value in given.items()}  # fmt: skip
+    with pytest.raises(ManifestError, match=f"^{named}"):
+        check_values("own_images", notebook_parameters(PATH) | values)
+    check_values("own_images", notebook_parameters(PATH) | {"photographs": str(tmp_path), "hold_out": 4})
+
+
+@pytest.mark.slow
+def test_photographs_without_poses_become_map_and_queries(small_capture: Path, tmp_path: Path) -> None:
+    photographs, session = tmp_path / "photographs", Session.open(small_capture / "sessions" / "ios_map")
+    photographs.mkdir()
+    for row in range(6):
+        (photographs / session.image_path(row).name).symlink_to(session.image_path(row))
+    given = {"photographs": str(photographs), "hold_out": 4}
+    for said in ("6 of 6 photographs in the model", "imported before from the same input, kept"):
+        execute(PATH, tmp_path / "out.ipynb", given)
+        assert said in (tmp_path / "out.ipynb").read_text()
+    assert "there and back: 5 images" in (tmp_path / "out.ipynb").read_text()
+    with pytest.raises(StageError, match="hold_out: then 4, now 3"):
+        execute(PATH, tmp_path / "out.ipynb", given | {"hold_out": 3})
+
+
 @pytest.mark.slow
 def test_it_runs_again_and_stops_where_the_input_is_another(small_capture: Path, tmp_path: Path) -> None:
     folders = {"sessions_root": str(small_capture / "sessions"), "out_dir": str(tmp_path / "OWN")}
@@ -138,6 +179,6 @@ def test_it_runs_again_and_stops_where_the_input_is_another(small_capture: Path,
     assert "imported before from the same input, kept" in page
     table = str(next((tmp_path / "OWN").rglob("map.csv")))
     photos = str(small_capture / "sessions" / "ios_map" / "raw_data")
-    other = folders | {"map_images": photos, "map_table": table, "query_images": photos}
+    other = {"out_dir": folders["out_dir"], "map_images": photos, "map_table": table, "query_images": photos}
     with pytest.raises(StageError, match=r"ios_query was imported from other input \(images: then "):
         execute(PATH, tmp_path / "other.ipynb", other)

@@ -453,8 +453,10 @@ def test_notebook_parameters_of_a_wrong_type_are_named(stage: str, values: dict[
 
 
 @pytest.mark.parametrize("unit", [None, 1, 0.01])
-def test_the_unit_of_poses_may_be_a_whole_number_or_unknown(unit: float | None) -> None:
-    notebook.check_values("own_images", {"unit_m": unit})
+def test_the_unit_of_poses_may_be_a_whole_number_or_unknown(unit: float | None, tmp_path: Path) -> None:
+    (tmp_path / "poses.csv").touch()
+    images = {"map_images": str(tmp_path), "map_table": str(tmp_path / "poses.csv"), "query_images": str(tmp_path)}
+    notebook.check_values("own_images", images | {"unit_m": unit})
 
 
 @pytest.mark.parametrize("name", [*STAGES, "own_images", "compare"])

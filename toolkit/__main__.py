@@ -54,6 +54,13 @@ QueryDevice = Annotated[str, Argument(help="Query device.")]
 TextFile = Annotated[Path, Argument(help="Text file.")]
 _AXES = "Camera axes of the poses. opencv: x right, y down, z forward; opengl: x right, y up, z backward."
 Axes = Annotated[str, Option("--axes", metavar="opencv|opengl", help=_AXES)]
+_DIRECTION = "Direction of the table's poses; the last has camera centers, as NVM, Bundler and Cambridge have them."
+HoldOut = Annotated[int, Option(metavar="N", help="Every Nth image becomes a query with truth; 0: none.")]
+Unit = Annotated[float | None, Option(metavar="METERS", help="Meters per unit of the poses if known.")]
+MatchNames = Annotated[
+    bool, Option("--match-names", help="Take files whose names differ only in case, extension or separators.")
+]
+_APPLIED = "Undo applied_transform and applied_scale, by which nerfstudio has changed the world of its input."
 _NAMES = "Name imported images as in your folder (own), or as in the capture (capture)."
 Names = Annotated[str, Option("--names", metavar="own|capture|file", help=_NAMES)]
 Settings = Annotated[
@@ -63,6 +70,7 @@ Capture = Annotated[Path | None, Option(help="Capture folder, if it has moved si
 Json = Annotated[bool, Option("--json", help="Print only a summary as JSON to stdout, everything else to stderr.")]
 _CLUSTER = "Dask workers: N on this machine, of a scheduler, or started by a cluster's queue (see docs/scaling.md)."
 _KINDS = "7scenes, 12scenes, cambridge, aachen, eth3d, tum, kitti or euroc."
+_ONLY = "Run only this stage; `map`: build the maps without queries, for `localize`."
 _SWEEP = "Run once per value, each in its own folder, and compare. Repeat it to run all combinations."
 _FAILED = (
     "What to write for a query without a pose. `nearest`, the default: the pose of its best retrieved reference, as "
@@ -78,7 +86,7 @@ _TABLE = "CSV with a header: image; qw,qx,qy,qz,tx,ty,tz for poses; camera_id, o
 @app.command()
 def run(
     manifest: Annotated[Path, Argument(help="Manifest, for example data_manifests/demo.yaml.")],
-    only: Annotated[str | None, Option(metavar="STAGE", help="Run only this stage.")] = None,
+    only: Annotated[str | None, Option(metavar="STAGE", help=_ONLY)] = None,
     force: Annotated[bool, Option("--force", help="Also run stages that are up to date.")] = False,
     overrides: Settings = None,
     name: Annotated[str | None, Option(help="Name of the run folder; default: says what --set changes.")] = None,
@@ -112,6 +120,8 @@ def run(
             _print_json(_summary_of_stopped(manifest, overrides or (), name, in_place) | outcome)
         raise
     tell(f"Report: {run_dir / 'report.html'}")
+    if only == pipeline.MAP:
+        tell(f"Localize a photograph: python -m toolkit localize {run_dir} PHOTOGRAPH")
     result = summary(run_dir)
     if as_json:
         _print_json(result)
@@ -123,7 +133,7 @@ def run(
 def localize(
     run: Run,
     photographs: Annotated[list[Path], Argument(help="Image files.")],
-    device: Annotated[str, Option(help="Map device.")] = "ios",
+    device: Annotated[str | None, Option(help="Map device; default: the first of the run.")] = None,
     scene: Annotated[str | None, Option(help="Capture; default: the run's only one.")] = None,
     camera: Annotated[
         str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics; default: estimated from the matches.")
@@ -135,11 +145,11 @@ def localize(
     import numpy as np
 
     from toolkit.capture import parse_camera
-    from toolkit.errors import CameraError, CaptureError, reason_of
+    from toolkit.errors import CameraError, CaptureError
     from toolkit.exchange.georeference import GEO_COLUMNS, geographic_poses, origin_of
     from toolkit.geometry import qt_from_pose
     from toolkit.scene import Run as FinishedRun
-    from toolkit.scene import localize_image
+    from toolkit.scene import localize_images
 
     try:
         given = None if camera is None else parse_camera("camera", camera)
@@ -150,22 +160,18 @@ def localize(
     with suppress(CaptureError):
         origin = origin_of(place.session)
     rows, poses = [], [np.full((4, 4), np.nan)]
-    for path in photographs:
-        row: dict[str, Any] = {"image": str(path), "status": "", "world_from_cam": None}
-        try:
-            result = localize_image(place, path, given)
-            row |= {"status": result.status_text, "inliers": result.num_inliers, "remark": result.remark}
-            if result.world_from_rig is not None:
-                poses.append(result.world_from_rig)
-                row |= {"world_from_cam": result.world_from_rig.tolist(), "position_std_m": result.position_std_m}
-                if origin is not None:
-                    geo = geographic_poses(poses[-1][None], origin)[0].tolist()
-                    row |= {name: None if np.isnan(one) else one for name, one in zip(GEO_COLUMNS, geo, strict=True)}
-        except ToolkitError as error:
-            row["status"] = f"failed: {reason_of(error, f'localize {path}')}"
+    for path, result in zip(photographs, localize_images(place, photographs, given), strict=True):
+        row: dict[str, Any] = {"image": str(path), "status": result.status_text, "world_from_cam": None}
+        row |= {"inliers": result.num_inliers, "remark": result.remark}
+        if result.world_from_rig is not None:
+            poses.append(result.world_from_rig)
+            row |= {"world_from_cam": result.world_from_rig.tolist(), "position_std_m": result.position_std_m}
+            if origin is not None:
+                geo = geographic_poses(poses[-1][None], origin)[0].tolist()
+                row |= {name: None if np.isnan(one) else one for name, one in zip(GEO_COLUMNS, geo, strict=True)}
         rows.append(row)
         if not as_json:
-            print(f"{path}: {row['status']}. {row.get('remark', '')}")
+            print(f"{path}: {row['status']}. {row['remark']}".strip())
             if row["world_from_cam"] is not None:
                 qw, qx, qy, qz, *xyz = qt_from_pose(np.array(row["world_from_cam"])).tolist()
                 print(f"  position {xyz[0]:.3f} {xyz[1]:.3f} {xyz[2]:.3f}, qw qx qy qz "
@@ -319,13 +325,20 @@ def import_colmap(
     capture: Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
     device: Device = "ios",
     split: Annotated[str, Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
+    hold_out: HoldOut = 0,
+    unit: Unit = None,
+    axes: Axes = "opencv",
+    match_names: MatchNames = False,
     placing: Placing = "link",
     masks: Masks = None,
 ) -> None:
     """Make a session from a COLMAP model: cameras, poses, rigs."""
     from toolkit.exchange import interchange
 
-    print(interchange.import_colmap(model, images, capture, device, split, placing, masks).text())
+    report = interchange.import_colmap(
+        model, images, capture, device, split, placing, axes, unit, hold_out, match_names, masks
+    )
+    print(report.text())
 
 
 @import_app.command("images")
@@ -336,8 +349,9 @@ def import_images(
     split: Annotated[str, Option(metavar="map|query", help="A map needs a table with poses.")] = "query",
     table: Annotated[Path | None, Option(help=_TABLE)] = None,
     poses_are: Annotated[
-        str, Option(metavar="world_from_cam|cam_from_world", help="Direction of the table's poses.")
+        str, Option(metavar="world_from_cam|cam_from_world|rotation_of_cam_from_world", help=_DIRECTION)
     ] = "world_from_cam",
+    hold_out: HoldOut = 0,
     axes: Axes = "opencv",
     unit: Annotated[float, Option(metavar="METERS", help="Meters per unit of the poses, e.g. 0.01.")] = 1.0,
     truth: Annotated[Path | None, Option(help="CSV like the table, with ground-truth poses of queries.")] = None,
@@ -345,6 +359,9 @@ def import_images(
         str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all images; else guessed from EXIF.")
     ] = None,
     cameras: Annotated[Path | None, Option(help="COLMAP's cameras.txt.")] = None,
+    only: Annotated[list[str] | None, Option(metavar="PATTERN", help="Only such images: '*.color.png'.")] = None,
+    skip: Annotated[list[str] | None, Option(metavar="PATTERN", help="No such images: 'masks/*'.")] = None,
+    match_names: MatchNames = False,
     placing: Placing = "link",
     masks: Masks = None,
 ) -> None:
@@ -352,8 +369,9 @@ def import_images(
     from toolkit.exchange import interchange
 
     report = interchange.import_images(
-        images, capture, device, split, table, poses_are, camera, cameras, placing, axes, unit, truth, masks
-    )
+        images, capture, device, split, table, poses_are, camera, cameras, placing, axes, unit, truth, hold_out,
+        match_names, only, skip, masks,
+    )  # fmt: skip
     print(report.text())
 
 
@@ -383,16 +401,20 @@ def import_transforms(
     capture: Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
     device: Device = "ios",
     split: Annotated[str, Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
-    hold_out: Annotated[int, Option(metavar="N", help="Every Nth image becomes a query with truth; 0: none.")] = 0,
-    unit: Annotated[float | None, Option(metavar="METERS", help="Meters per unit of the poses if known.")] = None,
+    hold_out: HoldOut = 0,
+    unit: Unit = None,
     axes: Axes = "opengl",
+    undo_applied: Annotated[bool, Option("--undo-applied", help=_APPLIED)] = False,
+    match_names: MatchNames = False,
     placing: Placing = "link",
     masks: Masks = None,
 ) -> None:
     """Make a session from a transforms.json: cameras with distortion, poses."""
     from toolkit.exchange.transforms import import_transforms
 
-    for report in import_transforms(transforms, capture, device, split, placing, axes, unit, hold_out, masks):
+    for report in import_transforms(
+        transforms, capture, device, split, placing, axes, unit, hold_out, undo_applied, match_names, masks=masks
+    ):
         print(report.text())
 
 
@@ -457,12 +479,13 @@ def reconstruct(
     if not manifest.exists():
         new_manifest(manifest.stem, capture)
     print(f"Manifest: {manifest}")
+    run_dir = pipeline.run(manifest, only=None if hold_out else pipeline.MAP)
     if hold_out:
-        run_dir = pipeline.run(manifest)
-        print(f"Report: {run_dir / 'report.html'}\nLocalize more: python -m toolkit localize {run_dir} PHOTOGRAPH")
-    else:
-        print(f"Import queries: python -m toolkit import images QUERIES {capture} --device {device}{result.camera}")
-        print(f"Then run it: python -m toolkit run {manifest}")
+        print(f"Report: {run_dir / 'report.html'}")
+    print(f"Localize a photograph: python -m toolkit localize {run_dir} PHOTOGRAPH --picture above.png")
+    if not hold_out:
+        print(f"Or many: python -m toolkit import images QUERIES {capture} --device {device}{result.camera}, and then")
+        print(f"python -m toolkit run {manifest}")
 
 
 @export_app.command("colmap")

@@ -1,6 +1,7 @@
 """Artifacts on disk: written atomically, each with a record of its settings, inputs and checksums."""
 
 import csv
+import errno
 import glob
 import hashlib
 import json
@@ -12,19 +13,26 @@ import re
 import secrets
 import shutil
 import tempfile
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import xxhash
 
 from toolkit import __version__
 from toolkit.errors import ArtifactError, ToolkitError
 
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
+
 log = logging.getLogger(__name__)
+
+NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
+"""Errors of file systems that have no locks."""
 
 
 @contextmanager
@@ -69,6 +77,32 @@ def temporary_folder(path: str | Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(".partial", f".{path.name}.{process_tag()}-", path.parent) as folder:
         yield Path(folder)
+
+
+def try_lock(path: Path) -> "tuple[BaseFileLock, bool]":
+    """Return a lock, and whether this process got it, without waiting.
+
+    On file systems without locks (NFS without lockd, FUSE), it is a `SoftFileLock`: a file that exists while the lock
+    is held. A process that is killed leaves it; where its host is another, a person must remove it.
+    """
+    from filelock import FileLock, SoftFileLock, Timeout
+
+    lock: BaseFileLock = FileLock(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of filelock, that it takes a SoftFileLock for ENOSYS
+            lock.acquire(timeout=0)
+    except Timeout:
+        return lock, False
+    except (OSError, NotImplementedError) as error:  # NotImplementedError: ENOSYS in earlier versions of filelock
+        if isinstance(error, OSError) and error.errno not in NO_LOCKS:
+            raise
+        lock = SoftFileLock(path.with_name(f"{path.name}.mark"))
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            return lock, False
+    return lock, True
 
 
 def process_tag() -> str:

@@ -151,6 +151,31 @@ def localize_pairs(
     return table.frame(settings)
 
 
+def build_maps(
+    sessions_root: str | Path, retrieval_dir: str | Path, out_dir: str | Path, features_dir: str | Path,
+    map_dir: str | Path, settings: LocalizeSettings, devices: Sequence[str],
+) -> list[Map]:  # fmt: skip
+    """Build the maps of `devices` without queries, so that `Map.open` can open them.
+
+    Args:
+        sessions_root, retrieval_dir, out_dir, features_dir, map_dir, settings: see `localize_pairs`.
+
+    Raises:
+        ManifestError, WeightsError, CaptureError: see `localize_pairs`.
+    """
+    folders = _Folders(*map(Path, (sessions_root, retrieval_dir, out_dir, features_dir, map_dir)))
+    stage, maps = _Stage(folders, resolve_auto(settings), "all", skip_existing=True), list[Map]()
+    with fixed_sums:
+        for device in devices:
+            maps.append(stage.open_map(device))
+            record = map_record_path(folders.out, stage.capture.name, device)
+            made_by = attributes(stage.settings, stage.kinds, stage.capture, device, folders.retrieval)
+            write_text(record, json.dumps(maps[-1].record(), indent=1) + "\n")
+            write_groups(record.with_suffix(".h5"), (), made_by)
+    PairRows(stage.capture.name, folders.out).frame(stage.settings)
+    return maps
+
+
 class _Folders(NamedTuple):
     """The folders given to `localize_pairs`."""
 

@@ -451,6 +451,34 @@ def check_given(name: str) -> None:
     check_values(name, values)
 
 
+_OWN = ("photographs", "map_images", "query_images")
+_NEEDS = {"map_table": ("map_images",), "query_table": ("query_images",), "camera": _OWN, "hold_out": ("photographs",),
+          "poses_are": _OWN[1:], "unit_m": _OWN[1:]}  # fmt: skip
+"""Of notebook 00: parameters that have an effect only if one of these is given, too."""
+_EXCLUDES = {"photographs": ("map_images",), "sessions_root": _OWN, "hold_out": ("query_images",)}
+"""Of notebook 00: parameters that have no effect if one of these is given."""
+
+
+def _check_own_images(given: Mapping[str, Any]) -> None:
+    """Refuse parameters of notebook 00 that would have no effect, and files that are not there."""
+    for name, found in given.items():
+        if name in (*_OWN, "map_table", "query_table", "sessions_root") and not Path(found).expanduser().exists():
+            raise ManifestError(f"{name}: found {str(found)!r}, which does not exist.")
+        if name in _NEEDS and not {*_NEEDS[name]} & given.keys():
+            raise ManifestError(f"{name}: found {found!r}, which has no effect without {' or '.join(_NEEDS[name])}.")
+        if other := next((other for other in _EXCLUDES.get(name, ()) if other in given), None):
+            raise ManifestError(f"{name}: found {found!r}, which has no effect with {other}. Give one of them.")
+    if "map_images" in given and "map_table" not in given:
+        do = "Give a table, or name the folder in photographs instead: then the poses are estimated"
+        raise ManifestError(f"map_table: found None, but a map needs poses. {do}.")
+    if "query_images" in given and not given.keys() & {*_OWN[:2]}:
+        raise ManifestError("map_images: found None, expected the folder of your map, with query_images.")
+    if given.get("hold_out", 2) < 2:
+        raise ManifestError(f"hold_out: found {given['hold_out']}, expected 2 or more, for some queries.")
+    if "map_images" in given and "query_images" not in given:
+        raise ManifestError("query_images: found None, expected the folder of your queries, with map_images.")
+
+
 def _check_devices_and_queries(stage: str, sessions: Path) -> None:
     """Refuse parameters of the running notebook that name devices or query lists which the capture does not have."""
     from toolkit.capture import Capture
@@ -537,6 +565,8 @@ def check_values(name: str, values: Mapping[str, Any]) -> None:
             raise _of_parameter(key, explain(error, model, path.name)) from None
         except ManifestError as error:
             raise _of_parameter(key, str(error)) from None
+    if name == "own_images":
+        _check_own_images({key: value for key, value in given.items() if value != defaults[key]})
 
 
 def _of_parameter(key: str, text: str) -> ManifestError:
@@ -551,7 +581,7 @@ _TYPES: dict[str, Any] = {
     "device": str | list[str],
     "inspect": int | str,
     "pairs": Annotated[list[Pair], Field(strict=False)] | None,
-    "poses_are": Literal["world_from_cam", "cam_from_world"],
+    "poses_are": Literal["world_from_cam", "cam_from_world", "rotation_of_cam_from_world"],
     "others": Annotated[list[Folder], Field(strict=False)] | None,
     "unit_m": float | None,
 }

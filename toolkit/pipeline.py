@@ -77,6 +77,9 @@ log = logging.getLogger(__name__)
 
 _DEMO, _DEMO_RUN = NOTEBOOKS.parent / "data_manifests" / "demo.yaml", (NOTEBOOKS.parent / DEMO_RUN).resolve()
 
+MAP = "map"
+"""In place of a stage: build the maps for queries to come."""
+_FOR_MAP = ("embed", "retrieve", "localize")
 MOST_WARNINGS = 5
 """Limit of warnings per stage on the terminal; `run.log` has all of them."""
 
@@ -191,7 +194,7 @@ def run(
 
     Args:
         manifest_path: YAML file, see `toolkit.manifest`.
-        only: run only this stage, on the results of earlier stages.
+        only: run only this stage, on the results of earlier stages; or `map`: build the maps without queries.
         force: also execute stages that are up to date, without reuse of their own results.
         overrides: `key=value` or `stage.key=value`, replace values of the manifest.
         say: prints progress lines; called like `print`.
@@ -243,9 +246,9 @@ def run_name(
 
 def _check(manifest: Manifest, manifest_path: str | Path, only: str | None) -> None:
     """Raise ManifestError for what can be seen to fail before anything runs."""
-    if only is not None and only not in STAGES:
-        raise ManifestError(f"--only {only}: no such stage. {nearest(only, STAGES)}")
-    if only is not None and only not in manifest.stages:
+    if only is not None and only not in (*STAGES, MAP):
+        raise ManifestError(f"--only {only}: no such stage. {nearest(only, (*STAGES, MAP))}")
+    if only not in (None, MAP, *manifest.stages):
         raise ManifestError(f"--only {only}: {manifest_path} has no section `{only}`, so the stage is off.")
     fetch = f"python -m toolkit download {manifest_path}"
     for capture in map(Path, manifest.captures):
@@ -306,7 +309,7 @@ def sweep(
 
 def _run(manifest: Manifest, only: str | None, force: bool, say: Say, cluster: str | None) -> Path:
     run_dir = Path(manifest.output_root) / manifest.name
-    stages = [only] if only else [stage for stage in STAGES if stage in manifest.stages]
+    stages = [*_FOR_MAP] if only == MAP else [only] if only else [one for one in STAGES if one in manifest.stages]
     if "sequence" in stages:
         require_gtsam()
     for stage in stages:
@@ -318,7 +321,10 @@ def _run(manifest: Manifest, only: str | None, force: bool, say: Say, cluster: s
         raise ManifestError(f"output_root: {run_dir} cannot be made ({error.strerror}). Choose another.") from None
     with held(run_dir), open_cluster(cluster, say), Kernels(run_dir / "notebooks") as kernels:
         try:
-            _run_stages(manifest, stages, run_dir, force, say, kernels)
+            if only == MAP:
+                _build_maps(manifest, run_dir, say)
+            else:
+                _run_stages(manifest, stages, run_dir, force, say, kernels)
         except BaseException as error:
             log.debug("stopped", exc_info=error)
             if exit_code(error) != 3 or isinstance(error, StageError):
@@ -389,6 +395,48 @@ def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: boo
         except Exception as other:
             log.warning("The report of the stopped run could not be written: %s", sentence(other))
             log.debug("the report", exc_info=other)
+        raise
+
+
+def _build_maps(manifest: Manifest, run_dir: Path, say: Say) -> None:
+    """Build features, descriptors and points of the maps as the stages would, which then find them."""
+    from toolkit.capture import Capture
+    from toolkit.embed import embed_sessions
+    from toolkit.localize import build_maps
+    from toolkit.retrieve import index_maps
+
+    captures = _captures(manifest)
+    inputs = {capture.name: tree_fingerprint(capture / "sessions") for capture in captures}
+    jobs = [
+        _job(manifest, stage, capture, SceneFiles(run_dir, capture.name), False)
+        for capture, stage in product(captures, manifest.stages)
+    ]
+    record = RunLog(
+        run_dir, manifest, inputs, _code_fingerprint(), lambda: [row for job in jobs if (row := job.earlier_row())]
+    )
+    if manifest.rerank is not None:
+        say("rerank: not used for photographs that are localized in a map by itself")
+        manifest = manifest.model_copy(update={"rerank": None})
+    embed = EmbedSettings.of(manifest.stage("embed"))
+    retrieve = RetrieveSettings.of(manifest.stage("retrieve"))
+    localize = LocalizeSettings.of(manifest.stage("localize"))
+    try:
+        record.write()
+        for capture in captures:
+            files, sessions = SceneFiles(run_dir, capture.name), capture / "sessions"
+            pairs = _selection(manifest, capture).get("pairs", ())
+            devices = list(dict.fromkeys(of_map for of_map, _ in pairs)) or Capture.open(capture).devices_with("map")
+            embed_sessions(sessions, files.embeddings, embed, device=devices)
+            index_maps(sessions, files.embeddings, files.retrieval_dir, retrieve, devices)
+            folders = files.retrieval_dir, files.poses_dir, files.features, files.maps
+            for scene_map in build_maps(sessions, *folders, localize, devices):
+                points = 0 if scene_map.points is None else len(scene_map.points.points)
+                say(f"map of {scene_map.device} in {capture.name}: {len(scene_map.session)} images, {points} points. "
+                    f"{scene_map.remarks}".strip())  # fmt: skip
+        record.end()
+        _write_report(run_dir)
+    except BaseException as error:
+        record.end(error)
         raise
 
 

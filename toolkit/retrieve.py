@@ -143,6 +143,25 @@ def retrieve_pairs(
     return table.frame(settings)
 
 
+def index_maps(
+    sessions_root: str | Path, map_feats_root: str | Path, out_dir: str | Path, settings: RetrieveSettings,
+    devices: Sequence[str],
+) -> None:  # fmt: skip
+    """Do what `retrieve_pairs` does for the maps of `devices`, without queries: indexes, and the settings in a file.
+
+    Raises:
+        CaptureError, ArtifactError: a map has no embedded image with a pose, or a value is not finite.
+    """
+    capture, embeddings = Capture.from_sessions_root(sessions_root), Path(map_feats_root)
+    for device in devices:
+        database = _load_database(capture[f"{device}_map"], embeddings, settings.normalize)
+        try:
+            make_index(embeddings, database.session.id, database.vectors, settings)
+        except ValueError as error:
+            raise ArtifactError(f"map {database.session.id}: {error}") from error
+    PairRows(capture.name, Path(out_dir)).frame(settings)
+
+
 @dataclass(frozen=True)
 class _Images:
     """Embedded images of a session."""

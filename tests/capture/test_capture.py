@@ -1,4 +1,5 @@
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from toolkit.capture import (
     write_depth,
     write_session,
 )
+from toolkit.capture.check import check_capture
 from toolkit.errors import CaptureError
 
 CAPTURES = Path(__file__).parents[2].parent / "shared" / "data" / "captures"
@@ -350,7 +352,7 @@ def test_line_numbers_hold_in_a_long_file(tmp_path: Path) -> None:
 def test_every_camera_model_of_colmap_opens(tmp_path: Path) -> None:
     import pycolmap
 
-    models = set(pycolmap.CameraModelId.__members__) - {"INVALID", "EQUIRECTANGULAR"}
+    models = [name for name in pycolmap.CameraModelId.__members__ if name not in ("INVALID", "EQUIRECTANGULAR")]
     cameras = {name: pycolmap.Camera.create_from_model_name(0, name, 50.0, 64, 48) for name in models}
     sensors = [
         (name, "", "camera", name, 64, 48, *(camera.params + 0.125).tolist()) for name, camera in cameras.items()
@@ -476,9 +478,9 @@ def test_keyframe_lists(session: Session) -> None:
 def test_depth_maps(session: Session, tmp_path: Path) -> None:
     assert session.depths is not None
     assert session.depths.to_numpy().tolist() == [[10, "s/depth", "s/d/10.png"]]
-    depth = np.array([[0, 1.5], [70, np.nan], [-1, 65.535]], np.float32)
+    depth = np.array([[0, 1.5], [70, np.nan], [-1, 65.534]], np.float32)
     write_depth(tmp_path / "d.png", depth)
-    np.testing.assert_array_equal(read_depth(tmp_path / "d.png"), np.float32([[0, 1.5], [0, 0], [0, 65.535]]))
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.png"), np.float32([[0, 1.5], [0, 0], [0, 65.534]]))
     with pytest.raises(CaptureError, match="Depth map"):
         read_depth(tmp_path / "none.png")
     (tmp_path / "bad.png").write_bytes(b"no image")
@@ -571,6 +573,31 @@ def test_real_captures_open(name: str) -> None:
 )
 def test_a_camera_reads_back_as_it_was_written(text: str) -> None:
     assert camera_text(parse_camera("camera", text)) == text
+
+
+def test_a_session_without_access_leaves_the_others(
+    small_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = Path(shutil.copytree(small_capture, tmp_path / small_capture.name))
+    exists = Path.exists
+
+    def denied(path: Path) -> bool:  # root may enter everything, so chmod does not show it
+        if path.parent.name == "ios_query":
+            raise PermissionError(13, "Permission denied", str(path))
+        return exists(path)
+
+    monkeypatch.setattr(Path, "exists", denied)
+    capture = Capture.open(place)
+    assert "ios_query" not in capture.session_ids
+    assert "ios_map" in capture.session_ids
+    problems = [problem for problem in check_capture(place).errors if problem.session == "ios_query"]
+    assert len(problems) == 1
+    assert "Permission denied" in problems[0].message
+
+
+def test_a_panorama_is_refused_as_a_camera() -> None:
+    with pytest.raises(ValueError, match="EQUIRECTANGULAR"):
+        parse_camera("camera", "EQUIRECTANGULAR, 2048, 1024, 2048, 1024")
 
 
 def test_a_focal_length_of_zero_is_refused() -> None:

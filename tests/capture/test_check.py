@@ -16,6 +16,42 @@ PINHOLE = ("camera", "PINHOLE", 64, 48, 50.5, 51.5, 32.0, 24.0)
 QT = "1, 0, 0, 0, 0, 0, 0"
 
 
+@pytest.mark.parametrize(
+    ("times", "asked"),
+    [
+        ([0, 1_400_000_000, 2_800_000_000, 4_200_000_000], "1,400,000,000 us (1,400 s): are these nanoseconds?"),
+        ([0, 33, 66, 100], "33 us: are these milliseconds?"),
+        ([10, 11, 12, 13], "1 us: are these seconds?"),
+        ([1_700_000_000_000_000_000 + k * 33_000_000 for k in range(4)], "are these nanoseconds?"),
+        ([0, 33_000, 66_000, 100_000], ""),
+        ([1_700_000_000_000_000 + k * 60_000_000 for k in range(4)], ""),
+        ([0, 2_000], ""),
+    ],
+)
+def test_times_of_another_unit_are_asked_about(times: list[int], asked: str, tmp_path: Path) -> None:
+    session = tmp_path / "PLACE" / "sessions" / "ios_query"
+    images = [(time, "cam", f"{time}.jpg") for time in times]
+    listed = pd.DataFrame({"timestamp": times, "device_id": "cam"})
+    write_session(session, [("cam", "", *PINHOLE)], None, None, images, keyframes={"pruned_subsampled": listed})
+    problems = check_capture(tmp_path / "PLACE").problems
+    questions = [problem.message for problem in problems if "are these" in problem.message]
+    assert len(questions) == bool(asked)
+    assert all(message.endswith(asked) for message in questions)
+
+
+def test_photographs_that_were_moved_are_one_problem(capture: Path) -> None:
+    photos = capture / "sessions" / "hl_map" / "raw_data" / "s"
+    moved = capture.parent / "moved"
+    photos.rename(moved)
+    for path in moved.rglob("*.jpg"):
+        link = photos / path.relative_to(moved)
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(capture / "gone" / path.name)
+    (problem,) = check_capture(capture).errors
+    assert "4 of 4 files are links to files that are gone" in problem.message
+    assert f"{capture / 'gone'}" in problem.message
+
+
 @pytest.fixture
 def capture(tmp_path: Path) -> Path:
     """A capture without problems: a map of two rig frames and one query."""
@@ -217,12 +253,12 @@ def walk(capture: Path, step: list[float], turn: float = 0.01, frames: int = 12,
     qt[:, 0], qt[:, 2], qt[:, 4:] = np.cos(angles), np.sin(angles), np.outer(np.arange(frames), step)
     qt[:still, 4:] = 0.01 * np.arange(still)[:, None] / max(still, 1)  # about a tripod
     session = capture / "sessions" / "hl_map"
-    rows = [(time, "s/a", f"s/a/{time}.jpg") for time in range(frames)]
+    rows = [(time, "s/a", f"s/a/{time}.jpg") for time in range(0, 50_000 * frames, 50_000)]
     for _, _, path in rows:
         Image.new("RGB", (64, 48)).save(session / "raw_data" / path)
     shutil.rmtree(session / "proc", ignore_errors=True)
     (session / "rigs.txt").unlink(missing_ok=True)
-    poses = Trajectory(np.arange(frames), ["s/a"] * frames, qt)
+    poses = Trajectory(50_000 * np.arange(frames), ["s/a"] * frames, qt)
     write_session(session, [("s/a", "", *PINHOLE)], None, poses, rows, subsessions=["s"])
 
 

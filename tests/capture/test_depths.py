@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
-from toolkit.capture import Session, Trajectory, write_depth, write_session
+from toolkit.capture import Session, Trajectory, read_depth, write_depth, write_session
 from toolkit.capture.depths import MAX_OFFSET_US, DepthMaps, SeenDepth
 from toolkit.synthetic.render import Rays, paint, render
 from toolkit.synthetic.scene import Scene
@@ -200,3 +200,9 @@ def test_a_session_without_depth_maps(tmp_path: Path) -> None:
                   [(1, "c", "1.jpg")])  # fmt: skip
     seen = DepthMaps(Session.open(tmp_path / "ios_map")).of(0)
     assert seen.reason == "no depth map of this photograph"
+
+
+def test_the_largest_number_of_a_depth_map_is_unknown(tmp_path: Path) -> None:
+    """As in 7-Scenes."""
+    cv2.imwrite(str(tmp_path / "depth.png"), np.array([[0, 1], [65534, 65535]], np.uint16))
+    np.testing.assert_allclose(read_depth(tmp_path / "depth.png"), [[0, 0.001], [65.534, 0]], atol=1e-6)

@@ -272,8 +272,179 @@ def test_a_list_of_queries_of_hloc_is_a_table(folder: Path, tmp_path: Path) -> N
     expected = [f"SIMPLE_RADIAL, 64, 48, {50 + number}.0, 30.0, 20.5, -0.01" for number in range(2)]
     assert cameras[names].tolist() == expected
     table.write_text("\n".join([lines[0], lines[1].replace("-0.01", "x")]))
-    with pytest.raises(CaptureError, match=r"queries_with_intrinsics\.txt, line 2"):
-        import_images(folder, tmp_path / "TWO", split="query", table=table)
+    status = import_images(folder, tmp_path / "TWO", split="query", table=table).images.set_index("image")["status"]
+    assert status["a/2.jpg"] == "imported"
+    assert "queries_with_intrinsics.txt, line 2" in status["b/1.jpg"]
+
+
+def test_rotations_of_cam_from_world_with_camera_centers(folder: Path, tmp_path: Path) -> None:
+    names = ["a/2.jpg", "a/10.png", "b/1.jpg"]
+    given = [make_pose(pose(k)[:3, :3].T, pose(k)[:3, 3]) for k in range(3)]
+    table = write_table(tmp_path / "t.csv", names, given)
+    options = {"split": "map", "table": table, "camera": CAMERA, "poses_are": "rotation_of_cam_from_world"}
+    import_images(folder, tmp_path / "PLACE", **options)
+    found = poses_of(Capture.open(tmp_path / "PLACE")["ios_map"])
+    for k, name in enumerate(names):
+        np.testing.assert_allclose(found[name], pose(k), rtol=0, atol=1e-9)
+
+
+def test_a_row_that_cannot_be_used_leaves_the_others(folder: Path, tmp_path: Path) -> None:
+    table = tmp_path / "t.csv"
+    table.write_text(
+        "image,qw,qx,qy,qz,tx,ty,tz,camera_id\na/2.jpg,nan,0,0,0,1,2,3,1\na/10.png,0.707,0.707,0,0,1,2,3,1\n"
+        "b/1.jpg,1,0,0,0,1,2,3,2\n"
+    )
+    cameras = tmp_path / "cameras.txt"
+    cameras.write_bytes("1 PINHOLE 64 48 50 51 32 24\r\n2 PINHOLE 64 48 0 51 32 24\r\n".encode("utf-16"))
+    report = import_images(folder, tmp_path / "PLACE", split="map", table=table, cameras=cameras)
+    status = report.images.set_index("image")["status"]
+    assert status["a/10.png"] == "imported"
+    assert "line 2" in status["a/2.jpg"]
+    assert "cameras.txt, line 2" in status["b/1.jpg"]
+    rotation = poses_of(Capture.open(tmp_path / "PLACE")["ios_map"])["a/10.png"][:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    truth = tmp_path / "truth.csv"
+    truth.write_text("image,qw,qx,qy,qz,tx,ty,tz\na/2.jpg,0,0,0,0,1,2,3\na/10.png,1,0,0,0,1,2,3\n")
+    report = import_images(folder, tmp_path / "PLACE", camera=CAMERA, truth=truth)
+    assert (report.images["status"] == "imported").all()
+    assert any("1 images have no usable ground truth; first: a/2.jpg: line 2" in note for note in report.notes)
+
+
+def test_a_table_in_utf16_is_read(folder: Path, tmp_path: Path) -> None:
+    table = write_table(tmp_path / "t.csv", ["a/2.jpg"], [pose(0)])
+    table.write_bytes(table.read_text().encode("utf-16"))
+    import_images(folder, tmp_path / "PLACE", split="map", table=table, camera=CAMERA)
+    np.testing.assert_allclose(poses_of(Capture.open(tmp_path / "PLACE")["ios_map"])["a/2.jpg"], pose(0), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("line", "name"), [("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "KITTI"), ("# time\n1305.1 1 2 3 0 0 0 1\n" * 3, "TUM")]
+)
+def test_lists_of_poses_without_names_are_recognized(line: str, name: str, folder: Path, tmp_path: Path) -> None:
+    table = tmp_path / "poses.txt"
+    table.write_text(line)
+    with pytest.raises(CaptureError, match=rf"poses\.txt: looks like {name}"):
+        import_images(folder, tmp_path / "PLACE", split="map", table=table, camera=CAMERA)
+
+
+def test_the_unit_and_the_axes_of_a_model(model: Path, tmp_path: Path) -> None:
+    report = import_colmap(model, tmp_path / "photos", tmp_path / "A", device="hl")
+    assert any(note.startswith("unit of the poses: not known") for note in report.notes)
+    assert Capture.open(tmp_path / "A").unit is None
+    report = import_colmap(model, tmp_path / "photos", tmp_path / "B", device="hl", unit_m=0.5, axes="opengl")
+    assert not any("unit" in note for note in report.notes)
+    assert Capture.open(tmp_path / "B").unit == "m"
+    given, found = (poses_of(Capture.open(tmp_path / place)["hl_map"]) for place in "AB")
+    assert given.keys() == found.keys()
+    for name in given:
+        expected = given[name] @ np.diag([1.0, -1, -1, 1])
+        expected[:3, 3] *= 0.5
+        np.testing.assert_allclose(found[name], expected, rtol=0, atol=1e-9)
+
+
+def test_frames_are_held_out_as_queries(model: Path, tmp_path: Path, folder: Path) -> None:
+    whole = import_colmap(model, tmp_path / "photos", tmp_path / "WHOLE", device="hl")
+    report = import_colmap(model, tmp_path / "photos", tmp_path / "PLACE", device="hl", hold_out=2)
+    capture = Capture.open(tmp_path / "PLACE")
+    assert report.held_out is not None
+    assert f"{report.held_out.session}" in report.text()
+    parts = [poses_of(capture[name]) for name in ("hl_map", "hl_query")]
+    assert sorted(parts[1]) == ["phone/2.jpg", "rig/5.jpg"], "the second and fourth frame"
+    expected = poses_of(Capture.open(whole.session.parents[1])["hl_map"])
+    assert parts[0].keys() | parts[1].keys() == expected.keys()
+    for name, one in (parts[0] | parts[1]).items():
+        np.testing.assert_array_equal(one, expected[name])
+    assert check_capture(tmp_path / "PLACE").errors == []
+    table = write_table(tmp_path / "t.csv", ["a/2.jpg", "a/10.png", "b/1.jpg"], [pose(k) for k in range(3)])
+    options = {"split": "map", "table": table, "camera": CAMERA}
+    report = import_images(folder, tmp_path / "TABLE", hold_out=3, **options)
+    assert list(report.images["image"]) == ["a/2.jpg", "a/10.png"]
+    with pytest.raises(ManifestError, match="hold-out: found 4, but there are 3"):
+        import_images(folder, tmp_path / "OTHER", hold_out=4, **options)
+    assert not (tmp_path / "OTHER").exists()
+
+
+@pytest.mark.parametrize(
+    ("listed", "stored", "flag"),
+    [
+        ("A/IMG.JPG", "a/img.jpg", True),
+        ("a/img.png", "a/img.jpg", True),
+        ("a\\img.jpg", "a/img.jpg", True),
+        ("a/caf\u00e9.jpg", "a/cafe\u0301.jpg", False),
+        ("a/cafe\u0301.jpg", "a/caf\u00e9.jpg", False),
+        ("A/caf\u00e9.png", "a/cafe\u0301.jpg", True),
+    ],
+)
+def test_names_that_differ_a_little_from_their_files(listed: str, stored: str, flag: bool, tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    save(photos / stored)
+    save(photos / "other.jpg")
+    table = write_table(tmp_path / "t.csv", [listed], [pose(3)])
+    options = {"split": "map", "table": table, "camera": CAMERA}
+    if flag:
+        with pytest.raises(CaptureError, match=r"1 images differ from their files in case.*--match-names"):
+            import_images(photos, tmp_path / "PLACE", **options)
+    report = import_images(photos, tmp_path / "PLACE", match_names=flag, **options)
+    assert list(report.images["image"]) == [stored]
+    assert any("names of 1 images differ" in note for note in report.notes)
+    np.testing.assert_allclose(poses_of(Capture.open(tmp_path / "PLACE")["ios_map"])[stored], pose(3), atol=1e-9)
+
+
+def test_names_that_fit_two_files_are_not_guessed(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    for name in ("img.jpg", "IMG.png", "good.jpg"):
+        save(photos / name)
+    table = write_table(tmp_path / "t.csv", ["Img.jpg", "good.jpg"], [pose(3), pose(4)])
+    report = import_images(photos, tmp_path / "PLACE", split="map", table=table, camera=CAMERA, match_names=True)
+    assert report.images.set_index("image")["status"].to_dict() == {"Img.jpg": "no such file", "good.jpg": "imported"}
+
+
+def test_files_that_are_not_photographs_are_said(folder: Path, tmp_path: Path) -> None:
+    for name in ("x.heic", "y.HEIC", "z.gif"):
+        (folder / name).write_bytes(b"anything")
+    (folder / "caf\udce9.jpg").write_bytes(b"not Unicode")
+    PIL.Image.new("RGB", SIZE).save(folder / "t.tiff")
+    report = import_images(folder, tmp_path / "PLACE", camera=CAMERA)
+    assert sorted(report.images["image"]) == ["a/10.png", "a/2.jpg", "b/1.jpg", "t.tiff"]
+    assert (report.images["status"] == "imported").all()
+    text = report.text()
+    assert "2 files .heic are not read: pip install" in text
+    assert "1 files .gif are not read" in text
+    assert "1 images have a name that is not UTF-8" in text
+    assert check_capture(tmp_path / "PLACE", deep=True).problems == []
+
+
+def test_depth_and_masks_beside_photographs(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    rng = np.random.default_rng(0)
+    for k in range(2):
+        color = rng.integers(0, 255, (48, 64, 3)).astype(np.uint8)
+        (photos / "masks").mkdir(parents=True, exist_ok=True)
+        PIL.Image.fromarray(color).save(photos / f"{k}.color.png")
+        PIL.Image.fromarray((color[..., 0] * 255).astype(np.uint16)).save(photos / f"{k}.depth.png")
+        PIL.Image.fromarray(np.uint8(255) * (color[..., 0] > 99).astype(np.uint8)).save(photos / "masks" / f"{k}.png")
+    report = import_images(photos, tmp_path / "A", camera=CAMERA)
+    assert "have 16 bits or two values" in report.text()
+    for place, options in (("B", {"only": ["*.color.png"]}), ("C", {"skip": ["*.depth.png", "masks/*"]})):
+        report = import_images(photos, tmp_path / place, camera=CAMERA, **options)
+        assert list(report.images["image"]) == ["0.color.png", "1.color.png"]
+        assert "16 bits" not in report.text()
+        assert "4 images are left out by --only and --skip" in report.text()
+    with pytest.raises(CaptureError, match="none of 6 images fits"):
+        import_images(photos, tmp_path / "D", camera=CAMERA, only=["*.jpeg"])
+
+
+def test_a_capture_in_the_folder_of_photographs_is_skipped(folder: Path) -> None:
+    for place in (folder / "place", folder):
+        import_images(folder, place, camera=CAMERA)
+        report = import_images(folder, place, "spot", camera=CAMERA)
+        assert len(report.images) == 3
+        assert any("captures in the folder" in note for note in report.notes)
+
+
+def test_a_device_whose_session_name_would_be_too_long(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(ManifestError, match="40 bytes"):
+        import_images(folder, tmp_path / "PLACE", "a" * 60, camera=CAMERA)
 
 
 def test_cameras_come_from_a_file_or_the_table(folder: Path, tmp_path: Path) -> None:
@@ -352,6 +523,26 @@ def test_photographs_of_200_megapixels_are_imported(tmp_path: Path, recwarn: pyt
     assert row["status"] == "imported"
     assert row["camera"].startswith("SIMPLE_PINHOLE, 16320, 12240, ")
     assert not recwarn.list
+
+
+def test_time_zones_that_change_are_applied(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    save(photos / "a.jpg", time="2026:10:25 02:10:00", tags={0x9011: "+02:00"})
+    save(photos / "b.jpg", time="2026:10:25 02:05:00", tags={0x9011: "+01:00"})  # an hour later, less 5 minutes
+    report = import_images(photos, tmp_path / "PLACE", camera=CAMERA)
+    times = report.images.set_index("image")["timestamp"]
+    assert times["b.jpg"] - times["a.jpg"] == 55 * 60 * 10**6
+    assert any("time zone" in note for note in report.notes)
+    save(photos / "b.jpg", time="2026:10:25 02:15:00", tags={0x9011: "+02:00"})
+    report = import_images(photos, tmp_path / "SAME", camera=CAMERA)
+    assert report.images.set_index("image")["timestamp"]["a.jpg"] == times["a.jpg"] + 2 * 3600 * 10**6, "the clock's"
+
+
+@pytest.mark.parametrize("orientation", [0, 9, 65535])
+def test_an_orientation_that_means_nothing_is_ignored(orientation: int, tmp_path: Path) -> None:
+    save(tmp_path / "photos" / "a.jpg", tags={0x0112: orientation})
+    report = import_images(tmp_path / "photos", tmp_path / "PLACE", camera=CAMERA)
+    assert not any("orientation" in note for note in report.notes)
 
 
 def test_times_are_those_of_the_camera_where_all_have_one(tmp_path: Path) -> None:

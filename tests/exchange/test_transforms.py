@@ -240,10 +240,66 @@ def test_what_is_malformed_is_named_with_frame_and_key(tmp_path: Path, change: d
     content = json.loads(file.read_text())
     content["frames"][1] |= change
     file.write_text(json.dumps(content))
-    with pytest.raises(CaptureError, match=re.escape(message)) as error:
-        import_transforms(file, tmp_path / "PLACE")
-    assert str(error.value).startswith(f"{file}, frame 1")
-    assert not (tmp_path / "PLACE").exists()
+    if "file_path" in change:
+        with pytest.raises(CaptureError, match=re.escape(message)) as error:
+            import_transforms(file, tmp_path / "PLACE")
+        assert str(error.value).startswith(f"{file}, frame 1")
+        assert not (tmp_path / "PLACE").exists()
+        return
+    status = import_transforms(file, tmp_path / "PLACE")[0].images.set_index("image")["status"]
+    assert status["images/1.jpg"].startswith(f"{file}, frame 1")
+    assert message in status["images/1.jpg"]
+    assert sorted(status.index[status == "imported"]) == ["images/0.jpg", "images/2.jpg"], "the others go on"
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_file_of_another_encoding_is_read(encoding: str, tmp_path: Path) -> None:
+    file = write(tmp_path)
+    file.write_text(file.read_text(), encoding=encoding)
+    assert len(imported(file, tmp_path / "PLACE").images) == 3
+
+
+def test_the_splits_of_the_file_are_map_and_queries(tmp_path: Path) -> None:
+    names = [f"images/{k}.jpg" for k in range(3)]
+    split = {"train_filenames": names[:1], "test_filenames": names[1:2]}
+    reports = import_transforms(write(tmp_path, **split), tmp_path / "PLACE")
+    assert [report.session.name for report in reports] == ["ios_map", "ios_query"]
+    statuses = [dict(zip(report.images["image"], report.images["status"], strict=True)) for report in reports]
+    assert statuses[1] == {"images/1.jpg": "imported"}
+    assert statuses[0]["images/0.jpg"] == "imported"
+    assert "in none of train_filenames" in statuses[0]["images/2.jpg"]
+    (queries,) = import_transforms(tmp_path / "transforms.json", tmp_path / "OTHER", split="query")
+    assert (queries.images["status"] == "imported").all()
+
+
+def test_the_world_of_the_input_is_restored(tmp_path: Path) -> None:
+    turn = make_pose(quaternion_to_rotation([0.5, -0.5, 0.5, 0.5]), [1.0, -2.0, 3.0])
+    given = [turn @ matrix(k) for k in range(3)]
+    for pose in given:
+        pose[:3, 3] *= 0.25
+    frames = [{"file_path": f"images/{k}.jpg", "transform_matrix": pose.tolist()} for k, pose in enumerate(given)]
+    file = write(tmp_path, frames, applied_transform=turn[:3].tolist(), applied_scale=0.25)
+    (said,) = import_transforms(file, tmp_path / "SAID")
+    assert any("applied_scale 0.25" in note and "--undo-applied" in note for note in said.notes)
+    session = imported(file, tmp_path / "PLACE", undo_applied=True, unit_m=1.0)
+    for k, found in enumerate(session.world_from_cam()):
+        np.testing.assert_allclose(found, np.array(matrix(k)) @ np.diag([1, -1, -1, 1]), rtol=0, atol=1e-9)
+    write(tmp_path, frames, applied_transform=[[1, 0], [0, 1]])
+    with pytest.raises(CaptureError, match="applied_transform"):
+        import_transforms(file, tmp_path / "OTHER")
+
+
+@pytest.mark.parametrize("root", ["/home/them/project/", "C:/Users/them/", "C:\\Users\\them\\"])
+def test_absolute_paths_of_another_machine_are_found_by_their_ends(root: str, tmp_path: Path) -> None:
+    file = write(tmp_path)
+    content = json.loads(file.read_text())
+    for frame in content["frames"]:
+        path = root + frame["file_path"]
+        frame["file_path"] = path.replace("/", "\\") if "\\" in root else path
+    file.write_text(json.dumps(content))
+    (report,) = import_transforms(file, tmp_path / "PLACE")
+    assert list(report.images["image"]) == [f"images/{k}.jpg" for k in range(3)]
+    assert any(note.startswith("3 images have paths of another machine") for note in report.notes)
 
 
 def test_a_file_without_intrinsics_or_frames_is_refused(tmp_path: Path) -> None:

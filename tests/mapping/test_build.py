@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory, write_session
-from toolkit.capture.cameras import in_view, rays_of, view_bounds
+from toolkit.capture.cameras import in_view, invertible_share, rays_of, view_bounds
 from toolkit.errors import ArtifactError
 from toolkit.features.features import KINDS
 from toolkit.features.sift import SiftExtractor, SiftSettings
@@ -109,6 +109,47 @@ def test_the_view_of_a_pinhole() -> None:
     np.testing.assert_allclose(bounds, [-318 / 520, (640 - 318) / 520, -243 / 510, (480 - 243) / 510], atol=1e-12)
     points = np.array([[0, 0, 2], [1.2, 0, 2], [1.3, 0, 2], [0, 0, -2], [0, 0, 0.05], [0, 0.93, 2], [0, -1, 2.0]])
     assert in_view(points[None], bounds[None])[0].tolist() == [True, True, False, False, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("camera", "at_least", "below"),
+    [
+        (("OPENCV", [520, 510, 318, 243, -0.2, 0.06, 0.002, -0.001]), 1.0, 1.1),
+        (("OPENCV", [500, 500, 320, 240, -44, 300, 0, 0]), 0.0, 0.1),  # grows, shrinks and grows again
+        (("FULL_OPENCV", [500, 500, 320, 240, 0, 0, 0, 0, 0, -8, 0, 0]), 0.0, 0.5),  # a pole
+        (("SIMPLE_RADIAL", [500, 320, 240, -2]), 0.0, 0.5),
+        (("EUCM", [300, 300, 320, 240, 0.6, 40]), 0.0, 0.5),
+        (("EUCM", [300, 300, 320, 240, 0.6, 1.1]), 1.0, 1.1),
+        (("FOV", [400, 400, 320, 240, 1.4]), 1.0, 1.1),
+        (("OPENCV_FISHEYE", [230, 230, 320, 240, 0, 0, 0, 0]), 1.0, 1.1),
+        (("OPENCV_FISHEYE", [120, 120, 320, 240, 0, 0, 0, 0]), 0.0, 0.8),  # 229 degrees
+    ],
+)
+def test_the_share_of_an_image_whose_distortion_can_be_inverted(
+    camera: tuple[str, list[float]], at_least: float, below: float
+) -> None:
+    model, params = camera
+    share = invertible_share(pycolmap.Camera(model=model, width=640, height=480, params=params))
+    assert at_least <= share < below
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("FULL_OPENCV", [520, 510, 318, 243, 5, 3, 0, 0, 2, 5, 3, 2]),  # calibrated so by Azure Kinect: a pinhole
+        ("EUCM", [520, 510, 318, 243, 0, 40]),
+        ("PINHOLE", [6500, 6500, 320, 240]),
+        ("PINHOLE", [520, 510, 700, -20]),  # of a crop
+    ],
+)
+def test_cameras_that_colmap_silently_ignores_have_points(model: str, params: list[float]) -> None:
+    scene = Ring(pycolmap.Camera(model=model, width=640, height=480, params=params))
+    found = scene.triangulate()
+    truth = scene.truth(found)
+    assert len(found.points) > 5
+    seen = [len(np.intersect1d(a, b)) for a, b in zip(scene.point_of, scene.point_of[1:], strict=False)]
+    assert len(found.points) > 0.5 * max(seen)
+    np.testing.assert_allclose(found.points[found.obs_point], scene.points[truth], atol=1e-3)
 
 
 # --------------------------------------------------------------------------------------------------- pairs

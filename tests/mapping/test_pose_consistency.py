@@ -194,6 +194,11 @@ def test_a_focal_length_one_percent_off_is_not_worth_a_word(small_capture: Path,
     assert not SurveyedPairs(pairs, survey.images.world_from_cams).misfit(survey.images.cameras)
 
 
+def rotations_of_cam_from_world(poses: Floats) -> Floats:
+    """As NVM, Bundler and the Cambridge Landmarks have them, with the camera's center."""
+    return geometry.make_pose(np.swapaxes(poses[:, :3, :3], 1, 2), poses[:, :3, 3])
+
+
 @pytest.mark.parametrize(
     ("device", "change", "fits"),
     [
@@ -204,9 +209,12 @@ def test_a_focal_length_one_percent_off_is_not_worth_a_word(small_capture: Path,
         ("spot", mirrored, "a mirrored world"),
         ("ios", turned(ROLLED), "images turned by -90 degrees"),
         ("ios", quaternions_in_another_order, "quaternions in the order x, y, z, w"),
+        ("ios", rotations_of_cam_from_world, "rotations of cam_from_world"),
+        ("ios", lambda poses: geometry.invert(rotations_of_cam_from_world(poses)), "camera centers that were"),
         ("ios", shuffled, ""),
     ],
-    ids=["opengl", "inverted", "inverted rig", "both", "mirrored", "rolled", "quaternions", "shuffled"],
+    ids=["opengl", "inverted", "inverted rig", "both", "mirrored", "rolled", "quaternions", "centers",
+         "inverted centers", "shuffled"],
 )
 def test_the_convention_that_would_fit_is_found(
     small_capture: Path, small_features: Path, device: str, change: Change, fits: str
@@ -216,6 +224,7 @@ def test_the_convention_that_would_fit_is_found(
     assert found.fits.startswith(fits)
     assert bool(found.fits) == bool(fits)
     assert found.text
+    assert ("rotation_of_cam_from_world" in found.text) == fits.startswith(("rotations of", "camera centers"))
     assert ("the other `--axes`" in found.text) == ("OpenGL" in fits), "where an import has turned them, they are not"
 
 

@@ -1,5 +1,6 @@
 """The run folder: one run at a time, what killed runs left, and the log."""
 
+import errno
 import json
 import logging
 import os
@@ -44,6 +45,30 @@ def test_the_lock_of_a_killed_run_is_taken_over(tmp_path: Path, caplog: pytest.L
     with held(tmp_path):
         assert json.loads((tmp_path / ".run.lock.json").read_text())["pid"] == os.getpid()
     assert f"The run of process {killed} " in (tmp_path / LOG).read_text()
+
+
+@pytest.mark.parametrize("name", ["ENOLCK", "EOPNOTSUPP", "ENOSYS"])
+def test_a_file_system_without_locks_still_has_one_writer(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def flock(file: int, operation: int) -> None:
+        raise OSError(getattr(errno, name), os.strerror(getattr(errno, name)))
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    with held(tmp_path):
+        with pytest.raises(ToolkitError, match=rf"{os.getpid()} on .*delete .*\.run\.lock"), held(tmp_path):
+            pass
+        assert "has no locks" in (tmp_path / LOG).read_text()
+    assert [path.name for path in tmp_path.iterdir()] == [LOG]
+    with held(tmp_path):
+        (mark,) = [path for path in tmp_path.glob(".run.lock*") if path.suffix != ".json" and path.read_bytes()]
+        left = mark.read_text()
+    mark.write_text(left.replace(socket.gethostname(), "node17"))  # of a run that was killed on another computer
+    with pytest.raises(ToolkitError, match=f"delete {mark}") as error, held(tmp_path):
+        pass
+    Path(str(error.value).split("delete ")[1].split(": ")[0]).unlink()
+    with held(tmp_path):
+        pass
 
 
 def test_what_a_killed_run_left_is_removed_and_what_lives_is_kept(tmp_path: Path, dead: int) -> None:

@@ -7,6 +7,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pandas as pd
+import pycolmap
 import pytest
 from numpy.typing import NDArray
 
@@ -15,7 +17,7 @@ from toolkit.features.features import LocalFeatures
 from toolkit.manifest import LocalizeSettings
 from toolkit.pose.base import Localizer, Prior, Query, QueryMatches, References
 from toolkit.pose.result import CAMERA, QueryResult, Rival, Status
-from toolkit.scene.map import Map
+from toolkit.scene.map import Map, localize_images
 
 
 class Scripted(Localizer):
@@ -114,3 +116,31 @@ def test_a_query_that_nothing_can_help_is_not_asked_again(lacks: str) -> None:
     result = scripted_map(first, further, []).locate(query, references=references)
     assert (result.status_text, result.first_status) == (FAILED.status_text, None)
     assert not further.asked
+
+
+class OfOneCamera:
+    """A map in which images (H, W) of value 1 tell that the true focal length is 500 px, those of value 0 nothing."""
+
+    session = SimpleNamespace(sensors=pd.DataFrame({"sensor_type": [], "sensor_id": []}))
+
+    def query(self, image: Any, camera: pycolmap.Camera, *_: Any) -> tuple[float, bool]:
+        return camera.mean_focal_length(), bool(np.asarray(image).max())
+
+    def locate(self, query: tuple[float, bool], near: Any) -> QueryResult:
+        focal_px, tells = query
+        true = abs(focal_px - 500) < 1
+        result = replace(OK if true or not tells else DOUBTED, num_inliers=50)
+        return result if true or not tells else replace(result, focals_px=(500.0,))
+
+
+def test_images_of_one_camera_share_what_one_of_them_tells_of_its_focal_length() -> None:
+    told, telling_nothing, other_size = np.ones((48, 64), np.uint8), np.zeros((48, 64), np.uint8), np.zeros((48, 60))
+    images = [telling_nothing, told, other_size, "no image.jpg"]
+    results = localize_images(OfOneCamera(), images)  # type: ignore[arg-type]
+    assert [result.status_text for result in results[:3]] == ["ok", "ok", "low_confidence: camera?"]
+    assert results[0].remark.startswith("focal length 500 px, from 1 other")
+    assert results[1].remark.startswith("focal length 500 px, which fits")
+    assert "do not tell it" in results[2].remark
+    assert results[3].status_text.startswith("failed: ImageError")
+    alone = localize_images(OfOneCamera(), [telling_nothing])  # type: ignore[arg-type]
+    assert alone[0].status_text == "low_confidence: camera?"

@@ -2,11 +2,20 @@
 
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
+from toolkit import pipeline
+from toolkit.capture import Capture
+from toolkit.embed import embed_sessions
 from toolkit.errors import ArtifactError
-from toolkit.files import SceneFiles
+from toolkit.files import SceneFiles, file_fingerprint
+from toolkit.geometry import pose_error
+from toolkit.localize import localize_image, localize_pairs
+from toolkit.manifest import load_manifest
+from toolkit.results.pair import PairResults
+from toolkit.retrieve import retrieve_pairs
 from toolkit.scene import Run
 
 
@@ -45,3 +54,37 @@ def test_what_is_no_run_names_those_beside_it(tmp_path: Path) -> None:
     assert run.queries.empty
     with pytest.raises(ArtifactError, match="found the scenes none"):
         run.map("ios")
+
+
+def test_a_map_by_itself_localizes_as_a_run_with_queries(small_capture: Path, tmp_path: Path) -> None:
+    sessions = tmp_path / "PLACE" / "sessions"
+    sessions.mkdir(parents=True)
+    (sessions / "ios_map").symlink_to(small_capture / "sessions" / "ios_map")
+    manifest = tmp_path / "place.yaml"
+    manifest.write_text("captures: [PLACE]\noutput_root: runs\nqueries: all\nlocalize: {features: {escalation: []}}\n")
+    folder = pipeline.run(manifest, only="map", say=lambda *a, **k: None)
+    run = Run.open(folder)
+    assert (run.scenes, run.record["status"], run.queries.empty) == (["PLACE"], "done", True)
+    with pytest.raises(ArtifactError, match="no map of 'hl'"):
+        run.map("hl")
+    session = Capture.open(small_capture)["ios_query"]
+    cameras = session.cameras(np.arange(3))
+    results = [localize_image(run.map(), session.image_path(row), camera) for row, camera in enumerate(cameras)]
+    poses = np.stack([result.world_from_rig for result in results if result.world_from_rig is not None])
+    _, meters = pose_error(poses, session.world_from_cam(np.arange(3), ground_truth=True))
+    assert meters.max() < 0.05
+
+    (sessions / "ios_query").symlink_to(small_capture / "sessions" / "ios_query")
+    files, settings = SceneFiles(folder, "PLACE"), load_manifest(manifest)
+    made = file_fingerprint(files.maps / "ios_map.npz"), file_fingerprint(files.embeddings / "vlad.npz")
+    embed_sessions(sessions, files.embeddings, settings.embed, features_dir=files.features)
+    retrieve_pairs(sessions, files.embeddings, files.retrieval_dir, settings.retrieve, queries="all")
+    where = files.retrieval_dir, files.poses_dir, files.features, files.maps
+    localize_pairs(sessions, *where, settings.stage("localize"), queries="all")  # type: ignore[arg-type]
+    assert made == (file_fingerprint(files.maps / "ios_map.npz"), file_fingerprint(files.embeddings / "vlad.npz"))
+    pair = PairResults.open(files.poses_txt("ios", "ios"))
+    keys = list(zip(pair.table["timestamp"], pair.table["device_id"], strict=True))
+    rows = [keys.index(key) for key in zip(session.images["timestamp"][:3], session.device_ids[:3], strict=True)]
+    np.testing.assert_allclose(poses, pair.poses[rows], atol=1e-12)
+    assert len(run.queries) == 0  # of the run as it was opened
+    assert len(Run.open(folder).queries) == len(pair.table)

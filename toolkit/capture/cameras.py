@@ -57,6 +57,30 @@ def camera_text(camera: pycolmap.Camera) -> str:
     return ", ".join([camera.model.name, str(camera.width), str(camera.height), *params])
 
 
+def invertible_share(camera: pycolmap.Camera) -> float:
+    """Return the share of the image in which the camera's distortion can be inverted, on a grid of 15 x 15 pixels.
+
+    There, the ray of a pixel projects to it, and so does no ray closer to the axis. Of fisheye lenses, only the circle
+    that touches the longer sides counts: the corners may be black.
+    """
+    is_fisheye = "FISHEYE" in camera.model.name
+    if not is_fisheye and not np.any(camera.params[list(camera.extra_params_idxs())]):
+        return 1.0
+    size = np.array([camera.width, camera.height], np.float64)
+    pixels = np.stack(np.meshgrid(*np.linspace(np.zeros(2), size, 15).T), -1).reshape(-1, 2)
+    if is_fisheye:
+        pixels = pixels[np.linalg.norm(pixels - size / 2, axis=1) <= size.min() / 2]
+    rays = rays_of(camera, pixels)
+    angles = np.linspace(1 / 16, 1, 16) * np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])[:, None]  # (N, 16)
+    across = unit(rays[:, :2], 1e-9)[:, None] * np.sin(angles)[..., None]
+    on_the_way = np.concatenate([across, np.cos(angles)[..., None]], axis=2)
+    projected = np.asarray(camera.img_from_cam(on_the_way.reshape(-1, 3))).reshape(*angles.shape, 2)
+    center = np.array([camera.principal_point_x, camera.principal_point_y])
+    grows = np.diff(np.linalg.norm(projected - center, axis=2), axis=1) > -1e-3 * size.max()
+    returns = np.linalg.norm(projected[:, -1] - pixels, axis=1) < 0.01 * size.max()
+    return float((returns & grows.all(axis=1)).mean())
+
+
 def rays_of(camera: pycolmap.Camera, pixels: NDArray[np.floating]) -> Floats:
     """Return the unit viewing rays (N, 3), in the camera's frame, of pixels (N, 2)."""
     if not len(pixels):

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from toolkit.capture.cameras import CAMERA_TYPES, parse_camera
 from toolkit.capture.devices import OTHER_SESSIONS, SPLITS, kinds
-from toolkit.capture.folder import Capture
+from toolkit.capture.folder import IMPORT_RECORD, Capture
 from toolkit.capture.images import default_workers, prefetch, read_image, stored_size
 from toolkit.capture.names import HOW_TO_ALLOW, has_long_part
 from toolkit.capture.session import RAW_DATA, SUBSESSIONS, Session
@@ -27,6 +27,8 @@ ASKED = "pruned_subsampled"  # keyframe list that manifests localize by default
 SAME_PLACE_M = 1e-6  # positions closer than this are the same, meters
 PLACE_SHARE = 0.005  # positions closer than this share of the extent of all positions are one place, as of a tripod
 WALK = 10  # smallest number of steps between camera positions from which the direction of motion is judged
+SHORTEST_STEP_US, LONGEST_STEP_US = 1e3, 6e8  # median steps of a recording that are plausible
+LATEST_US = 4e15  # plausible time: the year 2096
 UNIT_TOLERANCE = 1e-3  # largest deviation of a quaternion's length from 1; beyond, it has lost digits
 Rule = tuple[Any, str, str]
 """Which rows break the rule, (N,) bool; the message, with `{column}` for a row's value; and the severity."""
@@ -102,6 +104,7 @@ def check_capture(path: str | Path, deep: bool = False) -> CheckReport:
             continue
         report.tables[session_id] = checker.summary()
         report.problems += checker.problems
+    report.problems += [Problem(name, "", 0, why, ERROR) for name, why in capture.unreadable.items()]
     return report
 
 
@@ -161,6 +164,7 @@ class _SessionCheck:
             message = f"no such list, the default for queries; found: {lists}. Set `queries` in the manifest, or add it"
             self._add(f"proc/keyframes_{ASKED}.txt", 0, message, WARNING)
         self._check_cameras()
+        self._check_steps()
         for file, rows in self.rows.items():
             for rule in (*self._rules(file, rows), *self._rules_of(file, rows)):
                 self._add_rows(file, *rule)
@@ -241,6 +245,22 @@ class _SessionCheck:
             else:
                 self.sizes[sensor] = verdict
 
+    def _check_steps(self) -> None:
+        """Report times that seem to have another unit than microseconds; those of imports are from EXIF."""
+        if (self.session.path / IMPORT_RECORD).is_file():
+            return
+        frames = self.session.images[["timestamp"]].assign(subsession=self.session.subsession_of())
+        steps = [np.diff(np.unique(times_of(one))) for _, one in frames.groupby("subsession")]
+        step_us = float(np.median(np.concatenate(steps))) if sum(map(len, steps)) >= 3 else 0.0
+        units = {"nanoseconds": 1e3, "milliseconds": 1e-3, "seconds": 1e-6}
+        text = f"the median step between images is {step_us:,.0f} us"
+        text = f"{text} ({step_us / 1e6:,.0f} s)" if step_us > 1e6 else text
+        fitting = [unit for unit, factor in units.items() if 1e4 <= step_us / factor <= 5e6]
+        if len(frames) and frames["timestamp"].max() > LATEST_US:
+            self._add("images.txt", 0, "times after the year 2096, as microseconds: are these nanoseconds?", WARNING)
+        elif step_us and fitting and not SHORTEST_STEP_US <= step_us <= LONGEST_STEP_US:
+            self._add("images.txt", 0, f"{text}: are these {' or '.join(fitting)}?", WARNING)
+
     def _check_files(self, file: str, rows: pd.DataFrame) -> None:
         sensors, path = self.rows["sensors.txt"], rows.columns[2]
         wrong = rows["sensor_id"].isin(sensors[~sensors["sensor_type"].isin(CAMERA_TYPES)]["sensor_id"])
@@ -254,7 +274,16 @@ class _SessionCheck:
         exist = np.array([os.path.lexists(f"{self.session.path}/{RAW_DATA}/{name}") for name in rows[path]], bool)
         self.missing[file] = int((~exist & inside).sum())
         self._add_rows(file, ~exist & inside, f"missing file {RAW_DATA}/{{{path}}}")
-        self._check_content(file, rows[exist & inside])
+        listed = rows[path].to_numpy()
+        gone = np.zeros(len(rows), bool)
+        gone[exist] = [not os.path.exists(f"{self.session.path}/{RAW_DATA}/{name}") for name in listed[exist]]  # noqa: PTH110
+        if gone.any():
+            self.missing[file] += int(gone.sum())
+            target = os.readlink(f"{self.session.path}/{RAW_DATA}/{listed[gone][0]}")  # noqa: PTH115
+            found = f"{gone.sum()} of {len(rows)} files are links to files that are gone, such as {target}"
+            do = "Move them back, or remove the session and import again; --images copy does not depend on them"
+            self._add(file, int(rows.index[gone][0]), f"{found}. {do}")
+        self._check_content(file, rows[exist & inside & ~gone])
 
     def _check_content(self, file: str, rows: pd.DataFrame) -> None:
         """Open the files of rows, and compare the size of images with that of their camera."""

@@ -32,9 +32,16 @@ class Capture:
             raise CaptureError(f"{self.path} is not a capture: it has no folder `sessions`. Expected {expected}.")
         require_name(self.name, "capture", self.path.parent)
         self._folders: dict[str, Path] = {}
+        self.unreadable: dict[str, str] = {}
+        """Why folders in `sessions` cannot be entered, by name."""
         for folder in sorted(self._root.iterdir()):
             name = session_id(folder.name)
-            is_session = any((folder / file).exists() for file in ("sensors.txt", "images.txt"))
+            try:
+                is_session = any((folder / file).exists() for file in ("sensors.txt", "images.txt"))
+            except OSError as error:  # others go on
+                log.warning("%s: left out: %s.", folder, error.strerror)
+                self.unreadable[folder.name] = f"{folder}: {error.strerror}. Give yourself access to it, or move it."
+                continue
             if is_session:
                 require_name(folder.name, "session", self._root)
             if is_session and (name not in self._folders or folder.name == name):
@@ -95,7 +102,8 @@ class Capture:
             return present
         if not present:
             expected = f"sessions/<device>_{split}, as made by `python -m toolkit import ... --split {split}`"
-            raise CaptureError(f"{self.path}: no {split} session. Expected {expected}.")
+            alone = " Without queries, build the map: run MANIFEST --only map." if split == "query" else ""
+            raise CaptureError(f"{self.path}: no {split} session. Expected {expected}.{alone}")
         if device not in present:
             known = f"Devices with one: {', '.join(present)} (or `all`)"
             raise CaptureError(f"No {split} session of device {device!r} in {self.path}. {known}.")

@@ -5,6 +5,7 @@ Also numbers of threads for loops over images, and a guess of intrinsics from EX
 
 import base64
 import os
+import re
 import stat
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -42,7 +43,7 @@ _REDUCED = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2
 _CGROUPS = Path("/sys/fs/cgroup")  # file names differ between versions 2 and 1
 HEADER_ERRORS = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
 # Numbers of the EXIF tags, and the length in millimeters of each value of FocalPlaneResolutionUnit.
-ORIENTATION, _EXIF, _TIME, _SUBSECOND = 0x0112, 0x8769, 0x9003, 0x9291
+ORIENTATION, _EXIF, _TIME, _SUBSECOND, _ZONE = 0x0112, 0x8769, 0x9003, 0x9291, 0x9011
 _FOCAL_MM, _FOCAL_35MM, _WIDTH = 0x920A, 0xA405, 0xA002
 _PLANE_X, _PLANE_UNIT = 0xA20E, 0xA210
 _UNIT_MM = {0.0: 25.4, 2.0: 25.4, 3.0: 10.0, 4.0: 1.0}  # 0, a missing tag, means inches
@@ -74,7 +75,8 @@ def _open(path: str | Path) -> Iterator[BinaryIO]:
         with open(path, "rb") as stream:
             yield stream
     except FileNotFoundError:
-        raise ImageError(f"Image not found: {path}") from None
+        target = f", a link to {os.readlink(path)}" if os.path.islink(path) else ""  # noqa: PTH114, PTH115
+        raise ImageError(f"Image not found: {path}{target}") from None
     except (OSError, ValueError) as error:  # ValueError: the name is not valid for a file
         raise ImageError(f"Image cannot be read: {path} ({error})") from None
 
@@ -305,6 +307,12 @@ def time_taken(exif: Mapping[int, Any]) -> int | None:
     return int(taken.timestamp()) * 10**6 + (int(f"{digits:0<6}"[:6]) if digits.isdecimal() else 0)
 
 
+def zone_of(exif: Mapping[int, Any]) -> int | None:
+    """Return the offset of the camera's clock from UTC, microseconds, from OffsetTimeOriginal; None without it."""
+    match = re.fullmatch(r"([+-])(\d\d):(\d\d)", str(exif.get(_ZONE, "")).strip(" \0"))
+    return None if match is None else int(f"{match[1]}1") * (int(match[2]) * 60 + int(match[3])) * 60 * 10**6
+
+
 def read_number(exif: Mapping[int, Any], tag: int) -> float:
     """Return the value of a tag as a number; 0 if it is missing, not a number or not finite."""
     try:
@@ -312,6 +320,11 @@ def read_number(exif: Mapping[int, Any], tag: int) -> float:
     except (TypeError, ValueError, ZeroDivisionError):
         return 0.0
     return number if np.isfinite(number) else 0.0
+
+
+def exif_key(exif: Mapping[int, Any]) -> tuple[str, ...]:
+    """Return make, model and focal lengths of a camera, empty where EXIF has none."""
+    return tuple(str(exif.get(tag, "")) for tag in EXIF_CAMERA)
 
 
 def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:

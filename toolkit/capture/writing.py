@@ -14,6 +14,7 @@ from toolkit.errors import CaptureError, ImageError
 from toolkit.files import write_atomic
 from toolkit.geometry import qt_from_pose
 
+UNKNOWN_DEPTH = 65535
 DEPTH_SCALE = 1000.0  # depth maps are 16-bit PNGs in millimeters
 _WIFI = "mac_addr, frequency_khz, rssi_dbm, name, scan_time_start_us, scan_time_end_us"
 _BLUETOOTH = "id, rssi_dbm, name"
@@ -94,6 +95,8 @@ def _line(values: Sequence[Any]) -> str:
 def read_depth(path: str | Path) -> NDArray[np.float32]:
     """Return a depth map, (H, W) float32 meters along the camera's z axis, 0 where unknown.
 
+    The largest number, 65535, means unknown, too, as in 7-Scenes.
+
     Raises:
         CaptureError: the file cannot be read or is not a 16-bit image.
     """
@@ -108,6 +111,7 @@ def read_depth(path: str | Path) -> NDArray[np.float32]:
     except ImageError as error:
         fault = f"no such file, or not a 16-bit image of one channel ({error})"
         raise CaptureError(f"Depth map {path}: {fault}. Expected a 16-bit PNG in millimeters.") from None
+    depth[depth == UNKNOWN_DEPTH] = 0
     return (depth / np.float32(DEPTH_SCALE)).astype(np.float32)
 
 
@@ -116,7 +120,7 @@ def write_depth(path: str | Path, depth_m: ArrayLike) -> None:
     import cv2
 
     millimeters = np.round(np.asarray(depth_m, np.float64) * DEPTH_SCALE)
-    in_range = (millimeters >= 0) & (millimeters <= 65535)  # False for NaN
+    in_range = (millimeters >= 0) & (millimeters < UNKNOWN_DEPTH)  # False for NaN
     done, png = cv2.imencode(".png", np.where(in_range, millimeters, 0).astype(np.uint16))
     if not done:
         raise CaptureError(f"Depth map of shape {millimeters.shape} cannot be written to {path}; expected (H, W).")

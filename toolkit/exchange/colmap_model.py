@@ -8,7 +8,7 @@ import codecs
 import mmap
 import re
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -73,7 +73,7 @@ def read_model(folder: Path) -> ColmapModel:
         raise CaptureError(f"{folder}: no such folder. Expected one with a COLMAP model.")
     suffixes = _formats(folder)
     if not suffixes:
-        models = sorted(path for path in folder.iterdir() if path.is_dir() and _formats(path))
+        models = [path for path in sorted([*folder.glob("*/"), *folder.glob("sparse/*/")]) if _formats(path)]
         if len(models) != 1:
             raise _no_model(folder, models)
         model = read_model(models[0])
@@ -89,6 +89,22 @@ def read_model(folder: Path) -> ColmapModel:
     return model
 
 
+def read_cameras(path: Path) -> dict[str, pycolmap.Camera | str]:
+    """Return the cameras in cameras.txt or cameras.bin by id as text; each may be why it cannot be used.
+
+    Raises:
+        CaptureError: the file is missing, damaged (names line or byte), or has no camera.
+    """
+    model = ColmapModel()
+    try:
+        (_binary_cameras if path.suffix == ".bin" else _text_cameras)(path, model)
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read ({error}). Expected COLMAP's cameras.txt.") from None
+    if not model.cameras:
+        raise CaptureError(f"{path}: no camera in it. Expected lines of `CAMERA_ID MODEL WIDTH HEIGHT PARAMS...`.")
+    return {str(number): camera for number, camera in model.cameras.items()}
+
+
 def _formats(folder: Path) -> list[str]:
     """Return the suffixes of the formats in which a folder has cameras and images."""
     return [suffix for suffix in _SUFFIXES if all((folder / f"{name}{suffix}").is_file() for name in _NEEDED)]
@@ -102,7 +118,7 @@ def _no_model(folder: Path, models: Sequence[Path]) -> CaptureError:
         sizes = []
         for path in models:
             with suppress(CaptureError):
-                sizes.append(f"{path.name} ({len(read_model(path).images)} images)")
+                sizes.append(f"{path.relative_to(folder)} ({len(read_model(path).images)} images)")
         return CaptureError(f"{folder}: found the models {', '.join(sizes)}. Give the folder of one of them.")
     found = ", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "nothing"
     expected = "cameras and images, both as .bin or both as .txt"
@@ -123,11 +139,13 @@ def _pose(values: Sequence[float]) -> Floats | str:
     return pose_from_qt(np.r_[row[:4] / norm, row[4:]])
 
 
-def _camera(model_name: str, size: Sequence[Any], params: Sequence[Any]) -> pycolmap.Camera | str:
+def _camera(
+    model_name: str, size: Sequence[Any], params: Sequence[Any], where: str = ""
+) -> pycolmap.Camera | str:
     try:
         return parse_camera("camera", ", ".join([model_name, *map(str, size), *map(str, params)]))
     except ValueError as error:
-        return f"its camera cannot be used: {error}"
+        return f"its camera cannot be used: {where}{error}"
 
 
 def _add_rig(model: ColmapModel, rig_id: int, cameras: dict[int, Floats | None], sensors: int) -> None:
@@ -140,13 +158,32 @@ def _add_rig(model: ColmapModel, rig_id: int, cameras: dict[int, Floats | None],
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Return number and text of the lines of a file that are no comments; empty ones, too."""
-    data = path.read_bytes()
-    marks = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-    # Names are those of files, which may have any bytes.
-    text = data.decode("utf-16") if data.startswith(marks) else data.decode("utf-8-sig", "surrogateescape")
-    for number, line in enumerate(re.split(r"\r\n|\n|\r", text), start=1):
-        if not line.startswith("#"):
-            yield number, line.strip()
+    number = 0
+    try:
+        # Names are those of files, which may have any bytes.
+        with path.open(encoding=encoding_of(path), errors="surrogateescape") as lines:
+            for number, line in enumerate(lines, start=1):
+                if not line.startswith("#"):
+                    yield number, line.strip(" \t\r\n")
+    except UnicodeError as error:
+        raise CaptureError(f"{path}, line {number + 1}: cannot be read as UTF-16 ({error}).") from None
+
+
+def encoding_of(path: Path) -> str:
+    """Return the encoding of a text file: UTF-16 by its mark or its zeros, else UTF-8."""
+    with path.open("rb") as file:
+        start = file.read(64)
+    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    zeros = start[0::2].count(0), start[1::2].count(0)
+    return "utf-8-sig" if max(zeros) < len(start) / 4 else ("utf-16-be" if zeros[0] > zeros[1] else "utf-16-le")
+
+
+def _new(path: Path, kind: str, number: int, known: Container[int]) -> int:
+    """Return the id of a camera, image, rig or frame. Raise CaptureError if the file has it already."""
+    if number in known:
+        raise CaptureError(f"{path}: {kind} {number} is in it twice. Export the model again.")
+    return number
 
 
 def _malformed(path: Path, number: int, line: str, expected: str) -> CaptureError:
@@ -158,7 +195,9 @@ def _text_cameras(path: Path, model: ColmapModel) -> None:
         if words := line.split():
             if len(words) < 4 or not words[0].isdecimal():
                 raise _malformed(path, number, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]")
-            model.cameras[int(words[0])] = _camera(words[1], words[2:4], words[4:])
+            model.cameras[_new(path, "camera", int(words[0]), model.cameras)] = _camera(
+                words[1], words[2:4], words[4:], f"{path.name}, line {number}: "
+            )
 
 
 def _text_images(path: Path, model: ColmapModel) -> None:
@@ -167,7 +206,7 @@ def _text_images(path: Path, model: ColmapModel) -> None:
     for number, line in _lines(path):
         words = line.split(maxsplit=9)
         is_image = _is_image(words)
-        if points_follow and not is_image:
+        if points_follow and not is_image and _is_points(line):
             points_follow = False
         elif is_image:
             without_points += points_follow
@@ -175,13 +214,15 @@ def _text_images(path: Path, model: ColmapModel) -> None:
                 values, image_id, camera_id = [float(word) for word in words[1:8]], int(words[0]), int(words[8])
             except ValueError:
                 raise _malformed(path, number, line, expected) from None
+            image_id = _new(path, "image", image_id, model.images)
             model.images[image_id] = ModelImage(words[9], camera_id, _pose(values))
             points_follow = True
         elif line:
             raise _malformed(path, number, line, expected)
     if without_points:
         model.notes.append(f"{path.name}: {without_points} images have no line of points, which is not needed")
-    stated = re.search(rb"# *Number of images: *(\d+)", path.read_bytes()[:2000])
+    with path.open(encoding=encoding_of(path), errors="replace") as file:
+        stated = re.search(r"# *Number of images: *(\d+)", file.read(2000))
     if stated and int(stated[1]) != len(model.images):
         model.notes.append(f"{path.name}: {len(model.images)} images, its header says {int(stated[1])}")
 
@@ -194,10 +235,17 @@ def _is_image(words: Sequence[str]) -> bool:
     if len(words) < 10 or not words[0].isdecimal() or not words[8].isdecimal():
         return False
     name = words[9].split()
-    return len(name) == 1 or not (_is_number(name[0]) and _is_number(name[-1]))
+    return len(name) == 1 or not (is_number(name[0]) and is_number(name[-1]))
 
 
-def _is_number(word: str) -> bool:
+def _is_points(line: str) -> bool:
+    """Tell whether a line is X Y POINT3D_ID for each point, by its length and its first point: it may be long."""
+    words = line.split(maxsplit=3)
+    numbers = line.count(" ") + 1 if "  " not in line and "\t" not in line else len(line.split())
+    return not words or (numbers % 3 == 0 and all(map(is_number, words[:2])) and words[2].lstrip("-").isdecimal())
+
+
+def is_number(word: str) -> bool:
     try:
         float(word)
     except ValueError:
@@ -224,7 +272,7 @@ def _text_rigs(path: Path, model: ColmapModel) -> None:
             raise _malformed(path, number, line, expected) from None
         if next(words, None) is not None:
             raise _malformed(path, number, line, expected)
-        _add_rig(model, rig_id, cameras, count)
+        _add_rig(model, _new(path, "rig", rig_id, model.rigs), cameras, count)
 
 
 def _text_frames(path: Path, model: ColmapModel) -> None:
@@ -241,7 +289,7 @@ def _text_frames(path: Path, model: ColmapModel) -> None:
             images = [int(data[k + 2]) for k in range(0, len(data), 3) if data[k] == "CAMERA"]
         except (ValueError, IndexError):
             raise _malformed(path, number, line, expected) from None
-        model.frames[frame_id] = ModelFrame(rig_id, pose, images)
+        model.frames[_new(path, "frame", frame_id, model.frames)] = ModelFrame(rig_id, pose, images)
 
 
 # Binary
@@ -290,14 +338,15 @@ def _binary_cameras(path: Path, model: ColmapModel) -> None:
             found = f"camera {camera_id} of the unknown model number {kind}"
             raise CaptureError(f"{path}: found {found}, expected one of {', '.join(known.values())}.")
         count = len(pycolmap.Camera.create_from_model_name(0, known[kind], 1.0, 1, 1).params)
-        model.cameras[camera_id] = _camera(known[kind], size, file.read(f"{count}d"))
+        camera = _camera(known[kind], size, file.read(f"{count}d"))
+        model.cameras[_new(path, "camera", camera_id, model.cameras)] = camera
 
 
 def _binary_images(path: Path, model: ColmapModel) -> None:
     file = _Binary(path)
     for _ in file:
         image_id, *values, camera_id = file.read("I7dI")
-        model.images[image_id] = ModelImage(file.name(), camera_id, _pose(values))
+        model.images[_new(path, "image", image_id, model.images)] = ModelImage(file.name(), camera_id, _pose(values))
         (points,) = file.read("Q")
         file.skip(24 * points)
 
@@ -314,7 +363,7 @@ def _binary_rigs(path: Path, model: ColmapModel) -> None:
                 pose = _pose(file.read("7d")) if file.read("B")[0] else None
             if kind == _CAMERA:
                 cameras[sensor_id] = None if isinstance(pose, str) else pose
-        _add_rig(model, rig_id, cameras, count)
+        _add_rig(model, _new(path, "rig", rig_id, model.rigs), cameras, count)
 
 
 def _binary_frames(path: Path, model: ColmapModel) -> None:
@@ -323,6 +372,7 @@ def _binary_frames(path: Path, model: ColmapModel) -> None:
         frame_id, rig_id, *values, count = file.read("II7dI")
         data = [file.read("iIQ") for _ in range(count)]
         images = [image_id for kind, _, image_id in data if kind == _CAMERA]
+        frame_id = _new(path, "frame", frame_id, model.frames)
         model.frames[frame_id] = ModelFrame(rig_id, _pose(values), images)
 
 

@@ -32,11 +32,11 @@ MAX_OFFSET_S = 0.02
 _SEVEN_SCENES = (525.0, 525.0, 320.0, 240.0)  # of the color camera, as usual for this data set; none is published
 _TWELVE_SCENES = (572.0, 572.0, 320.0, 240.0)  # at 640 x 480, where a scene has no info.txt
 _TUM = {
-    "freiburg1": "OPENCV, 640, 480, 517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026",
-    "freiburg2": "OPENCV, 640, 480, 520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001",
+    "freiburg1": "FULL_OPENCV, 640, 480, 517.3, 516.5, 318.6, 255.3, .2624, -.9531, -.0054, .0026, 1.1633, 0, 0, 0",
+    "freiburg2": "FULL_OPENCV, 640, 480, 520.9, 521.0, 325.1, 249.7, .2312, -.7849, -.0033, -.0001, .9172, 0, 0, 0",
     "freiburg3": "PINHOLE, 640, 480, 535.4, 539.2, 320.1, 247.6",
 }
-"""Intrinsics of the color cameras, from the data set's page; its third radial coefficient has no place in OPENCV."""
+"""Intrinsics of the color cameras, from the data set's page."""
 
 
 @dataclass(frozen=True)

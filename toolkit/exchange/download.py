@@ -31,7 +31,7 @@ from urllib.parse import unquote, urlsplit
 
 from toolkit.errors import DownloadError, ManifestError, ToolkitError
 from toolkit.exchange.archives import FileError, arrange, require_space, safe_path, size_text, unpack
-from toolkit.files import fingerprint
+from toolkit.files import fingerprint, try_lock
 from toolkit.manifest import DatasetSettings, Source, load_manifest, nearest
 from toolkit.models.hub import failure_reason, status_of
 
@@ -279,16 +279,17 @@ class _Capture:
 
     def run(self) -> "CheckReport":
         """Fetch, unpack and arrange all files of the capture; check it."""
-        from filelock import FileLock, Timeout
-
         from toolkit.capture.check import check_capture
 
         self.state.mkdir(parents=True, exist_ok=True)
+        lock, acquired = try_lock(self.state / "lock")
+        if not acquired:
+            do = f"Wait for it; if there is none, delete {lock.lock_file}."
+            raise DownloadError(f"{self.folder}: another download into this folder is running. {do}")
         try:
-            with FileLock(self.state / "lock", timeout=0):
-                self._fetch_all()
-        except Timeout:
-            raise DownloadError(f"{self.folder}: another download into this folder is running. Wait for it.") from None
+            self._fetch_all()
+        finally:
+            lock.release()
         report = check_capture(self.folder)
         print("\n" + report.text(most=20))
         if missing := [name for name in self.names if name not in report.tables]:

@@ -10,42 +10,48 @@ import csv
 import io
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pandas as pd
 import pycolmap
 
 from toolkit.capture import parse_camera
 from toolkit.capture.folder import IMPORT_RECORD
-from toolkit.capture.images import exif_camera
+from toolkit.capture.images import decode, exif_camera
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError, ImageError, ManifestError
-from toolkit.exchange.colmap_model import read_model
+from toolkit.exchange.colmap_model import NORM_TOLERANCE, encoding_of, is_number, read_cameras, read_model
 from toolkit.exchange.drafts import (
+    READ_SUFFIXES,
     SUBSESSION,
+    Draft,
     DraftImage,
     ImportReport,
     list_images,
     posed_camera,
     require_convention,
     start,
-    write_drafts,
+    write_with_queries,
 )
 from toolkit.exchange.transforms import import_transforms
 from toolkit.files import file_fingerprint, files_fingerprint, read_json, write_text
-from toolkit.geometry import Floats, invert, pose_from_qt
+from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
 from toolkit.manifest import nearest
 
-POSE_DIRECTIONS = ("world_from_cam", "cam_from_world")
+POSE_DIRECTIONS = ("world_from_cam", "cam_from_world", "rotation_of_cam_from_world")
 _CAMERA_COLUMNS = ("model", "width", "height", "params")
 
 
 def import_colmap(
     model: str | Path, images: str | Path, capture: str | Path, device: str = "ios", split: str = "map",
-    placing: str = "link", masks: str | Path | None = None,
+    placing: str = "link", axes: str = "opencv", unit_m: float | None = None, hold_out: int = 0,
+    match_names: bool = False, masks: str | Path | None = None,
 ) -> ImportReport:  # fmt: skip
     """Make a session from a COLMAP model and its images: cameras, poses, and the rigs that have several cameras.
 
@@ -59,13 +65,22 @@ def import_colmap(
         capture: folder of the capture; created if it does not exist.
         device, split: the session is `<device>_<split>`. Poses of queries become their ground truth.
         placing: `link` to the images, or `copy` them.
+        axes: camera axes of the poses, see `drafts.AXES`; COLMAP's are `opencv`.
+        unit_m: meters per unit of the poses; None: unknown, as after structure from motion. The poses are then not
+            scaled, and the session records that their unit is unknown.
+        hold_out: every `hold_out`-th frame of a map, in order of names, becomes a query with ground truth instead;
+            0: none.
+        match_names: take files whose names differ only in case, extension or separators.
         masks: folder of masks, see `images.find_mask`; they are placed as the images are.
 
     Raises:
         CaptureError: no model in the folder, or a damaged one; the session exists already, or no image is left.
-        ManifestError: an unknown split or placing, or a device that cannot be part of a name.
+        ManifestError: an unknown split, placing or axes, a unit that is not a positive length, an invalid `hold_out`,
+            or a device that cannot be part of a name.
     """
+    require_convention(axes, 1.0 if unit_m is None else unit_m)
     draft = start(capture, device, split, Path(images), placing, masks)
+    draft.match_names = match_names
     content = read_model(Path(model))
     draft.notes += content.notes
     rig_of_image = {
@@ -81,37 +96,40 @@ def import_colmap(
             (f"{SUBSESSION}/rig_{rig_id}", sensors[rig_id, camera_id], invert(sensor_from_rig))
             for camera_id, sensor_from_rig in calibrated.items()
         ]
-    moved, names = 0, set[str]()
+    moved, names, not_in_model = 0, set[str](), set[str]()
     for image_id, image in sorted(content.images.items()):
-        frame_id, frame = rig_of_image.get(image_id, (image_id, None))
+        frame_id, frame = rig_of_image.get(image_id, (f"image {image_id}", None))  # a frame may have the same number
         camera, pose = content.cameras.get(image.camera_id, "its camera is not in the model"), image.cam_from_world
         rig_name, sensor = None, f"{SUBSESSION}/cam_{image.camera_id}"
         if frame is not None:
-            rig_name, sensor = f"{SUBSESSION}/rig_{frame.rig_id}", sensors[frame.rig_id, image.camera_id]
+            rig_name, sensor = f"{SUBSESSION}/rig_{frame.rig_id}", sensors.get((frame.rig_id, image.camera_id), sensor)
             sensor_from_rig = content.rigs[frame.rig_id].get(image.camera_id)
-            pose = frame.rig_from_world if sensor_from_rig is not None else "its camera has no pose in its rig"
-            if not isinstance(pose, str) and not isinstance(image.cam_from_world, str):
+            pose = "its camera has no pose in its rig" if sensor_from_rig is None else frame.rig_from_world
+            if not (sensor_from_rig is None or isinstance(pose, str) or isinstance(image.cam_from_world, str)):
                 moved += not np.allclose(sensor_from_rig @ pose, image.cam_from_world, rtol=1e-4, atol=1e-4)
-        unusable = "its name occurs twice in the model" if image.name in names else camera
-        unusable = unusable if isinstance(unusable, str) else pose
+        if image.name in names:
+            draft.rows.append({"image": image.name, "status": "its name occurs twice in the model"})
+        elif isinstance(camera, str) or isinstance(pose, str):
+            draft.rows.append({"image": image.name, "status": camera if isinstance(camera, str) else pose})
+        else:
+            draft.images.append(DraftImage(image.name, camera, sensor, f"{frame_id}", rig_name))
+            draft.poses[f"{frame_id}"] = invert(pose)
         names.add(image.name)
-        if isinstance(unusable, str) or isinstance(camera, str):
-            draft.rows.append({"image": image.name, "status": unusable})
-            continue
-        draft.images.append(DraftImage(image.name, camera, sensor, f"{frame_id}", rig_name))
-        draft.poses[f"{frame_id}"] = invert(unusable)
     if moved:
         draft.notes.append(f"{moved} images have another pose than their rig gives them: that of the rig is taken")
-    not_in_model = set(list_images(draft.folder)) - names
+    with suppress(CaptureError):  # the model may be of images in other formats
+        not_in_model = set(list_images(draft.folder)) - names
     if not_in_model:
         draft.notes.append(f"{len(not_in_model)} images of the folder are not in the model")
-    return write_drafts(draft)[0]
+    draft.convert(axes, unit_m)
+    return write_with_queries(draft, hold_out)
 
 
 def import_images(
     images: str | Path, capture: str | Path, device: str = "ios", split: str = "query", table: str | Path | None = None,
     poses_are: str = "world_from_cam", camera: str | None = None, cameras: str | Path | None = None,
-    placing: str = "link", axes: str = "opencv", unit_m: float = 1.0, truth: str | Path | None = None,
+    placing: str = "link", axes: str = "opencv", unit_m: float | None = 1.0, truth: str | Path | None = None,
+    hold_out: int = 0, match_names: bool = False, only: Sequence[str] | None = None, skip: Sequence[str] | None = None,
     masks: str | Path | None = None,
 ) -> ImportReport:  # fmt: skip
     """Make a session from a folder of images without rigs.
@@ -123,14 +141,18 @@ def import_images(
         images: folder; without a table, all JPEG and PNG files in and below it are imported.
         capture, device, split, placing, masks: as for `import_colmap`. A map needs poses.
         table: CSV file, see the module's docstring.
-        poses_are: direction of the poses in table and truth, `world_from_cam` or `cam_from_world`.
+        poses_are: direction of the poses in table and truth: `world_from_cam`, `cam_from_world`, or
+            `rotation_of_cam_from_world`, whose positions are the camera centers, as in NVM, Bundler and the Cambridge
+            Landmarks.
         camera: intrinsics of all images, `MODEL, width, height, parameter, ...`, with COLMAP's models.
         cameras: COLMAP's cameras.txt. A single camera applies to all images; of several, the table's `camera_id`
             selects one.
         axes: camera axes of the poses, see `drafts.AXES`.
-        unit_m: meters per unit of the poses.
+        unit_m: meters per unit of the poses; None: unknown, see `import_colmap`.
         truth: CSV file like the table; its poses become the ground truth of queries. Images not in it are queries
             without ground truth.
+        hold_out, match_names: as for `import_colmap`.
+        only, skip: patterns such as `*.color.png`, without a table; only images of these names, and none of those.
 
     Raises:
         CaptureError: a malformed table or camera (names file and line), an image without intrinsics, a map without
@@ -140,24 +162,34 @@ def import_images(
     """
     if poses_are not in POSE_DIRECTIONS:
         raise ManifestError(f"poses_are: unknown {poses_are!r}. {nearest(poses_are, POSE_DIRECTIONS)}")
-    require_convention(axes, unit_m)
+    require_convention(axes, 1.0 if unit_m is None else unit_m)
     draft, folder = start(capture, device, split, Path(images), placing, masks), Path(images)
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder of images.")
-    rows = _read_table(Path(table)) if table is not None else pd.DataFrame({"image": list_images(folder), "line": 0})
+    draft.match_names = match_names
+    if table is not None:
+        rows = _read_table(Path(table))
+    else:
+        rows = pd.DataFrame({"image": _listed(draft, folder, only or (), skip or ()), "line": 0})
     if split == "map" and "qw" not in rows:
         given = f"a table with the columns image, {', '.join(POSE_NAMES)}"
         raise CaptureError(f"A map needs poses: give {given}, or import a transforms.json or a COLMAP model.")
-    listed_cameras = _read_cameras(Path(cameras)) if cameras is not None else {}
+    listed_cameras = read_cameras(Path(cameras)) if cameras is not None else {}
     shared_camera = None if camera is None else _camera(camera, "camera")
     posed = rows if truth is None else _read_truth(Path(truth), rows, split)
-    poses = _poses_of(posed, poses_are, axes, unit_m)
+    poses = _poses_of(posed, poses_are, axes, unit_m or 1.0)
+    bad_poses = {str(row["image"]): f"line {row['line']}: {row['problem']}" for row in _bad(posed).to_dict("records")}
+    if bad_poses and truth is not None:
+        first = next(iter(bad_poses.items()))
+        draft.notes.append(f"{len(bad_poses)} images have no usable ground truth; first: {first[0]}: {first[1]}")
     origins = Counter[str]()
     for row in rows.to_dict("records"):
         name, where = str(row["image"]), f"{table}, line {row['line']}"
         try:
+            if truth is None and name in bad_poses:
+                raise CaptureError(f"{table}, {bad_poses[name]}")
             image_camera, origin = _camera_of(row, listed_cameras, shared_camera, folder / name, where)
-        except ImageError as error:
+        except (ImageError, CaptureError) as error:
             draft.rows.append({"image": name, "status": str(error)})
             continue
         origins[origin] += 1
@@ -165,11 +197,13 @@ def import_images(
     if truth is not None:
         draft.notes.append(f"ground truth of {len(draft.poses)} of {len(rows)} images: {truth}")
     draft.notes += [f"intrinsics of {count} images: {origin}" for origin, count in origins.items()]
-    return write_drafts(draft)[0]
+    if poses:
+        draft.note_unit(unit_m)
+    return write_with_queries(draft, hold_out)
 
 
 def import_once(
-    images: str | Path | None, capture: str | Path, device: str, split: str, unit_m: float | None = 1.0, **options: Any
+    images: str | Path, capture: str | Path, device: str, split: str, unit_m: float | None = 1.0, **options: Any
 ) -> str:
     """Import images, unless the session was imported before from the same input. Return a message for the user.
 
@@ -179,10 +213,8 @@ def import_once(
 
     Raises:
         CaptureError: the session was imported from other input (the message names it); or as for the imports.
-        ManifestError: no folder is given, or not the folder of the transforms.json; or as for the imports.
+        ManifestError: not the folder of the transforms.json; or as for the imports.
     """
-    if images is None:
-        raise ManifestError(f"{split}_images: found None, expected the folder of your images: other inputs are given.")
     session = Path(capture) / "sessions" / f"{device}_{split}"
     inputs: dict[str, Any] = {"images": str(Path(images).resolve()), **options}
     if unit_m != 1:  # sessions of earlier versions do not record it
@@ -193,21 +225,40 @@ def import_once(
             inputs[name] = str(Path(inputs[name]).resolve())
     if inputs.get("camera") is not None and _has_cameras(table=options.get("table"), cameras=options.get("cameras")):
         inputs["camera"] = None  # the table or cameras.txt override it
-    inputs["files of images"] = files_fingerprint([Path(images) / name for name in list_images(Path(images))])
-    record = session / IMPORT_RECORD
-    if not session.exists():
-        file = options.get("table")
+    try:
+        names = list_images(Path(images), READ_SUFFIXES)
+    except CaptureError as error:
+        raise CaptureError(f"{split}_images: {error}") from None
+    inputs["files of images"] = files_fingerprint([Path(images) / name for name in names])
+
+    def make() -> str:
+        file, record = options.get("table"), session / IMPORT_RECORD
         if file is not None and _is_transforms(file):
             if Path(images).resolve() != Path(file).resolve().parent:
                 raise ManifestError(f"{split}_images: found {images}, expected the folder of {file}.")
             if (found := options.get("poses_are", POSE_DIRECTIONS[0])) != POSE_DIRECTIONS[0]:
                 raise ManifestError(f"poses_are: found {found!r}, expected world_from_cam, the direction in {file}.")
-            report = import_transforms(file, capture, device, split, unit_m=unit_m)[0]
+            report = import_transforms(file, capture, device, split, unit_m=unit_m, own_split=False)[0]
         else:
-            report = import_images(images, capture, device, split, unit_m=unit_m or 1.0, **options)
+            report = import_images(images, capture, device, split, unit_m=unit_m, **options)
         unknown = {"unit": None} if unit_m is None else {}
-        write_text(record, json.dumps(read_json(record) | unknown | {"input": inputs}, indent=1) + "\n")
+        write_text(record, json.dumps(read_json(record) | unknown, indent=1) + "\n")
         return report.text()
+
+    return once(session, inputs, make)
+
+
+def once(session: Path, inputs: Mapping[str, Any], make: Callable[[], str]) -> str:
+    """Make a session, unless it was made before from the same inputs. Return a message for the user.
+
+    Raises:
+        CaptureError: the session was made from other inputs; names them.
+    """
+    record = session / IMPORT_RECORD
+    if not session.exists():
+        text = make()
+        write_text(record, json.dumps(read_json(record) | {"input": inputs}, indent=1) + "\n")
+        return text
     before = read_json(record).get("input", {})
     if differing := [name for name in inputs if before.get(name) != inputs[name]]:
         changes = "; ".join(
@@ -238,6 +289,37 @@ def _sensors_of_rigs(rigs: Mapping[int, Mapping[int, Floats | None]]) -> dict[tu
 # Cameras
 
 
+def _listed(draft: Draft, folder: Path, only: Sequence[str], skip: Sequence[str]) -> list[str]:
+    """Return the images of a folder that fit the patterns, and note what is left out or looks like no photograph."""
+    names = list_images(folder, READ_SUFFIXES, draft.notes)
+    chosen = [name for name in names if not only or any(_fits(name, pattern) for pattern in only)]
+    chosen = [name for name in chosen if not any(_fits(name, pattern) for pattern in skip)]
+    if not chosen:
+        raise CaptureError(f"{folder}: none of {len(names)} images fits the patterns {', '.join([*only, *skip])}.")
+    if len(chosen) < len(names):
+        draft.notes.append(f"{len(names) - len(chosen)} images are left out by --only and --skip")
+    pngs = [name for name in chosen if name.lower().endswith(".png")]
+    sample = pngs[:: max(1, len(pngs) // 40)]
+    flat = [name for name in sample if _is_no_photograph(folder / name)]
+    if flat and len(flat) / len(sample) * len(pngs) >= 0.5 * len(chosen):
+        kinds = f"{len(flat)} of {len(sample)} PNG files that were looked at, such as {flat[0]}, have 16 bits or two"
+        draft.notes.append(f"{kinds} values, like depth and masks: leave such out with --only or --skip")
+    return chosen
+
+
+def _fits(name: str, pattern: str) -> bool:
+    return fnmatch(name, pattern) or fnmatch(Path(name).name, pattern)
+
+
+def _is_no_photograph(path: Path) -> bool:
+    """Tell whether an image has 16 bits in one channel, or at most two values."""
+    try:
+        pixels = decode(path, cv2.IMREAD_UNCHANGED)
+    except ImageError:
+        return False
+    return (pixels.dtype == np.uint16 and pixels.ndim == 2) or len(np.unique(pixels[::2, ::2])) <= 2
+
+
 def _camera(params: str, where: str) -> pycolmap.Camera:
     try:
         return parse_camera("camera", params)
@@ -246,7 +328,8 @@ def _camera(params: str, where: str) -> pycolmap.Camera:
 
 
 def _camera_of(
-    row: Mapping[Any, Any], by_id: Mapping[str, pycolmap.Camera], shared: pycolmap.Camera | None, path: Path, where: str
+    row: Mapping[Any, Any], by_id: Mapping[str, pycolmap.Camera | str], shared: pycolmap.Camera | None, path: Path,
+    where: str,
 ) -> tuple[pycolmap.Camera, str]:
     """Return the camera of an image and its origin: the table, cameras.txt, the camera shared by all images, or EXIF.
 
@@ -259,12 +342,18 @@ def _camera_of(
         if row["camera_id"] not in by_id:
             ids = ", ".join(by_id) or "none: give cameras.txt"
             raise CaptureError(f"{where}: camera_id {row['camera_id']!r} is not in cameras.txt (it has: {ids}).")
-        return by_id[row["camera_id"]], "those of cameras.txt"
+        return _usable(by_id[row["camera_id"]]), "those of cameras.txt"
     if len(by_id) > 1:
         raise CaptureError(f"cameras.txt has {len(by_id)} cameras; give a table with the columns image, camera_id.")
     if by_id:
-        return next(iter(by_id.values())), "the camera of cameras.txt"
+        return _usable(next(iter(by_id.values()))), "the camera of cameras.txt"
     return (shared, "the given camera") if shared is not None else exif_camera(path)
+
+
+def _usable(camera: pycolmap.Camera | str) -> pycolmap.Camera:
+    if isinstance(camera, str):
+        raise CaptureError(camera)
+    return camera
 
 
 def _has_cameras(table: str | Path | None, cameras: str | Path | None) -> bool:
@@ -273,22 +362,6 @@ def _has_cameras(table: str | Path | None, cameras: str | Path | None) -> bool:
         return True
     columns = _read_table(Path(table)).columns if table is not None else []
     return cameras is not None or not {"model", "camera_id"}.isdisjoint(columns)
-
-
-def _read_cameras(path: Path) -> dict[str, pycolmap.Camera]:
-    """Read COLMAP's cameras.txt: `CAMERA_ID MODEL WIDTH HEIGHT PARAMS...` per line."""
-    cameras: dict[str, pycolmap.Camera] = {}
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise CaptureError(f"{path}: cannot be read ({error}). Expected COLMAP's cameras.txt.") from None
-    for number, line in enumerate(lines, start=1):
-        words = line.split()
-        if words and not line.startswith("#"):
-            cameras[words[0]] = _camera(", ".join(words[1:]), f"{path}, line {number}")
-    if not cameras:
-        raise CaptureError(f"{path}: no camera in it. Expected lines of `CAMERA_ID MODEL WIDTH HEIGHT PARAMS...`.")
-    return cameras
 
 
 # Tables
@@ -310,12 +383,21 @@ def _read_truth(path: Path, images: pd.DataFrame, split: str) -> pd.DataFrame:
 
 
 def _poses_of(rows: pd.DataFrame, poses_are: str, axes: str, unit_m: float) -> dict[str, Floats]:
-    """Return world_from_cam (4, 4), meters, by image; empty if the table has no poses."""
+    """Return world_from_cam (4, 4), meters, by image with a valid pose; empty if the table has no poses."""
     if "qw" not in rows:
         return {}
+    rows = rows[rows["problem"] == ""]
     poses = pose_from_qt(rows[list(POSE_NAMES)].to_numpy(float))
-    poses = poses if poses_are == "world_from_cam" else invert(poses)
+    if poses_are == "cam_from_world":
+        poses = invert(poses)
+    elif poses_are == "rotation_of_cam_from_world":
+        poses = make_pose(np.swapaxes(poses[:, :3, :3], 1, 2), poses[:, :3, 3])
     return {str(name): posed_camera(pose, axes, unit_m) for name, pose in zip(rows["image"], poses, strict=True)}
+
+
+def _bad(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of a table whose poses are not valid."""
+    return rows[rows["problem"] != ""] if "qw" in rows else rows[:0]
 
 
 def read_poses(
@@ -330,13 +412,17 @@ def read_poses(
 
 
 def _read_table(path: Path) -> pd.DataFrame:
-    """Read the table of a folder of images, all values as text, with the additional column `line`."""
+    """Read the table of a folder of images, all values as text, with the additional column `line`.
+
+    With poses, column `problem` says why the pose of a row is none.
+    """
     if _is_transforms(path):
         raise CaptureError(f"{path}: not a CSV table. Import it by python -m toolkit import transforms.")
     try:
-        text = path.read_text(encoding="utf-8-sig")  # spreadsheets write the mark
-    except (OSError, UnicodeDecodeError) as error:
+        text = path.read_text(encoding=encoding_of(path))  # spreadsheets write UTF-16 and the mark
+    except (OSError, UnicodeError) as error:
         raise CaptureError(f"{path}: cannot be read as a CSV table ({error}).") from None
+    _require_names(path, text)
     first = next((line for line in text.splitlines() if line.strip()), "").split()
     of_hloc = len(first) > 4 and first[1] in pycolmap.CameraModelId.__members__
     rows = _read_hloc_list(text) if of_hloc else _read_csv(path, text)
@@ -356,14 +442,24 @@ def _read_table(path: Path) -> pd.DataFrame:
         raise CaptureError(f"{path}, line {rows['line'][twice].iloc[0]}: image {rows['image'][twice].iloc[0]!r} again.")
     if "qw" in rows:
         values = rows[list(POSE_NAMES)].apply(pd.to_numeric, errors="coerce").to_numpy(float)
-        wrong = ~np.isfinite(values).all(axis=1)
-        wrong |= np.abs(np.linalg.norm(np.nan_to_num(values[:, :4]), axis=1) - 1) > 1e-3
-        if wrong.any():
-            row = rows.iloc[int(np.argmax(wrong))]
-            found = ", ".join(row[list(POSE_NAMES)])
-            expected = "seven finite numbers, qw qx qy qz of length 1 and tx ty tz"
-            raise CaptureError(f"{path}, line {row['line']}: found the pose {found}; expected {expected}.")
+        lengths = np.linalg.norm(np.nan_to_num(values[:, :4]), axis=1)
+        wrong = ~np.isfinite(values).all(axis=1) | (np.abs(lengths - 1) > NORM_TOLERANCE)
+        found = ["found the pose " + ", ".join(row) for row in rows[list(POSE_NAMES)].to_numpy()]
+        expected = "expected seven finite numbers, qw qx qy qz of length 1 and tx ty tz"
+        rows["problem"] = [f"{one}; {expected}." if bad else "" for one, bad in zip(found, wrong, strict=True)]
+        if wrong.all() and len(rows):
+            raise CaptureError(f"{path}, line {rows['line'].iloc[0]}: {rows['problem'].iloc[0]}")
     return rows
+
+
+def _require_names(path: Path, text: str) -> None:
+    """Raise CaptureError for lists of poses without names: those of KITTI and TUM."""
+    lines = [line.replace(",", " ").split() for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
+    count = len(lines[0]) if lines else 0
+    kinds = {12: "KITTI's poses.txt, world_from_cam as 3 x 4 numbers", 8: "TUM's list, time tx ty tz qx qy qz qw"}
+    if count in kinds and all(is_number(word) for word in lines[0]):
+        need = f"a CSV with the header image, {', '.join(POSE_NAMES)} and one image per line"
+        raise CaptureError(f"{path}: looks like {kinds[count]}, without the names of images. Write {need}.")
 
 
 def _read_csv(path: Path, text: str) -> pd.DataFrame:

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture.images import (
-    EXIF_CAMERA,
     HEADER_ERRORS,
     ORIENTATION,
     exif_camera,
+    exif_key,
     find_mask,
     read_header,
     read_number,
@@ -214,7 +214,7 @@ def initial_cameras(
     keys: dict[Any, int] = {}
     numbers, cameras = list[int](), list[pycolmap.Camera]()
     for index, (item, size, folder) in enumerate(zip(photographs, sizes, folders, strict=True)):
-        tags = tuple(str(item.exif.get(tag, "")) for tag in EXIF_CAMERA)
+        tags = exif_key(item.exif)
         key = folder, size, tags, index if mixed[folder] and not any(tags) else None
         if key not in keys:
             keys[key] = len(cameras)

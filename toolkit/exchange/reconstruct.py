@@ -25,9 +25,19 @@ from toolkit.capture.cameras import camera_text
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.embedders.vlad import Vlad
 from toolkit.errors import CaptureError, ManifestError, WeightsError
-from toolkit.exchange.drafts import SUBSESSION, Draft, DraftImage, ImportReport, start, write_drafts
+from toolkit.exchange.drafts import (
+    IMAGE_SUFFIXES,
+    SUBSESSION,
+    Draft,
+    DraftImage,
+    ImportReport,
+    list_images,
+    start,
+    write_drafts,
+)
 from toolkit.exchange.georeference import RECORD, place, read_positions
-from toolkit.exchange.photographs import Photograph, gather, initial_cameras
+from toolkit.exchange.interchange import once
+from toolkit.exchange.photographs import OTHER_SUFFIXES, VIDEO_SUFFIXES, Photograph, gather, initial_cameras
 from toolkit.features.features import KINDS, LocalFeatures
 from toolkit.features.matching import (
     LocalMethod,
@@ -40,7 +50,7 @@ from toolkit.features.matching import (
 from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import FeatureStore, extract_session, match_sessions
 from toolkit.features.verification import epipolar_matches
-from toolkit.files import IMPORTED, link_folder, write_text
+from toolkit.files import IMPORTED, files_fingerprint, link_folder, write_text
 from toolkit.geometry import Floats, Ints, make_pose, unit
 from toolkit.manifest import LocalizeSettings, SiftSettings
 from toolkit.store.items import Items, heals
@@ -347,7 +357,7 @@ def reconstruct(
         ManifestError: a malformed argument.
     """
     if hold_out == 1 or hold_out < 0:
-        raise ManifestError(f"hold-out: found {hold_out}, expected 2 or more, or 0.")
+        raise ManifestError(f"hold_out: found {hold_out}, expected 2 or more, or 0.")
     if mapper not in ("incremental", "global"):
         raise ManifestError(f"mapper: found {mapper!r}, expected incremental or global.")
     folder = Path(capture) / FOLDER
@@ -365,7 +375,7 @@ def reconstruct(
     if not photographs:
         raise CaptureError(f"{sources[0]}: no photograph can be read. First: {next(iter(unreadable.items()))}")
     if hold_out > len(photographs):
-        raise ManifestError(f"hold-out: found {hold_out}, but there are {len(photographs)} photographs.")
+        raise ManifestError(f"hold_out: found {hold_out}, but there are {len(photographs)} photographs. Give less.")
     work = _Work(folder, device, photographs, given)
     work.unusable |= unreadable
     matcher = _Mutual(RATIO, shorten=KINDS["sift"].shorten)
@@ -430,6 +440,27 @@ def reconstruct(
     notes += placed.notes
     option = f" --camera '{camera_text(next(iter(model.cameras.values())))}'" if len(model.cameras) == 1 else ""
     return Reconstruction(reports, record, xyz.reshape(-1, 3), rgb.reshape(-1, 3), notes, option)
+
+
+def reconstruct_once(
+    photographs: str | Path, capture: str | Path, device: str = "ios", hold_out: int = 0, camera: str | None = None
+) -> str:
+    """Reconstruct, unless it was done before from the same photographs. Return a message for the user.
+
+    Args:
+        photographs: an image file, a folder of images, or a video.
+        capture, device, hold_out, camera: see `reconstruct`.
+
+    Raises:
+        CaptureError: the session was made from other input (the message names it); or as for `reconstruct`.
+        ManifestError: as for `reconstruct`.
+    """
+    source = Path(photographs)
+    names = [""] if source.is_file() else list_images(source, (*IMAGE_SUFFIXES, *OTHER_SUFFIXES, *VIDEO_SUFFIXES))
+    inputs = {"photographs": str(source.resolve()), "hold_out": hold_out, "camera": camera}
+    inputs["files of photographs"] = files_fingerprint([source / name for name in names])
+    session = Path(capture) / "sessions" / f"{device}_map"
+    return once(session, inputs, lambda: reconstruct([source], capture, device, hold_out, camera=camera).text())
 
 
 def _escalate(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> list[str]:

@@ -11,8 +11,9 @@ Each entry of `frames` may have these keys; keys it lacks are read from the top 
   coefficients of OpenCV's fisheye model (J. Kannala and S. Brandt, "A generic camera model and calibration method for
   conventional, wide-angle, and fish-eye lenses", PAMI 2006).
 
-Keys for rendering (`aabb_scale`, `scale`, `offset`, masks, depths) are ignored. So is `applied_transform`, because the
-matrices already include it.
+Keys for rendering (`aabb_scale`, `scale`, `offset`, masks, depths) are ignored. The matrices already include
+`applied_transform` and `applied_scale`, by which nerfstudio has changed the world of its input; they can be undone.
+`train_filenames`, `val_filenames` and `test_filenames` are the images of the map and, of the last two, the queries.
 """
 
 import json
@@ -28,8 +29,16 @@ import pycolmap
 from toolkit.capture import parse_camera
 from toolkit.capture.images import is_file, read_header
 from toolkit.capture.tables import FARTHEST_M
-from toolkit.errors import CaptureError, ImageError, ManifestError
-from toolkit.exchange.drafts import IMAGE_SUFFIXES, ImportReport, posed_camera, require_convention, start, write_drafts
+from toolkit.errors import CaptureError, ImageError
+from toolkit.exchange.drafts import (
+    IMAGE_SUFFIXES,
+    ImportReport,
+    posed_camera,
+    require_convention,
+    require_hold_out,
+    start,
+    write_drafts,
+)
 from toolkit.geometry import Floats
 
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -39,8 +48,8 @@ TOLERANCE = 1e-3  # largest deviation of R^T R from the identity, per element, t
 
 def import_transforms(
     path: str | Path, capture: str | Path, device: str = "ios", split: str = "map", placing: str = "link",
-    axes: str = "opengl", unit_m: float | None = None, hold_out: int = 0,
-    masks: str | Path | None = None,
+    axes: str = "opengl", unit_m: float | None = None, hold_out: int = 0, undo_applied: bool = False,
+    match_names: bool = False, own_split: bool = True, masks: str | Path | None = None,
 ) -> list[ImportReport]:  # fmt: skip
     """Make a session, or a map and a query session, from a transforms.json. Images keep their `file_path` as names.
 
@@ -50,7 +59,10 @@ def import_transforms(
         unit_m: meters per unit of the poses; None: unknown, as after structure from motion. The poses are then not
             scaled, and the session records that their unit is unknown.
         hold_out: every `hold_out`-th frame of a map, in order of names, becomes a query with ground truth instead;
-            0: none.
+            0: none, or those that the file names (`test_filenames`, `val_filenames`), if `own_split`.
+        undo_applied: return to the world before `applied_transform` and `applied_scale`, as of the COLMAP model that
+            the file was made from.
+        match_names: take files whose names differ only in case, extension or separators.
 
     Returns:
         The reports of the sessions, the map first.
@@ -61,26 +73,34 @@ def import_transforms(
             `hold_out`.
     """
     require_convention(axes, 1.0 if unit_m is None else unit_m)
-    if hold_out and (hold_out < 2 or split != "map"):
-        raise ManifestError(f"hold-out: found {hold_out} for a {split}, expected 2 or more, for a map.")
+    require_hold_out(hold_out, split, hold_out)
     path = Path(path)
-    splits = (split, "query") if hold_out else (split,)
-    drafts = [start(capture, device, name, path.parent, placing, masks) for name in splits]
     content = _read(path)
+    held = _named(content, "val_filenames", "test_filenames")
+    own_split = own_split and bool(held) and split == "map" and not hold_out
+    splits = (split, "query") if hold_out or own_split else (split,)
+    drafts = [start(capture, device, name, path.parent, placing, masks) for name in splits]
     frames: dict[str, _Frame] = {}
+    applied = _applied(path, content)
     for number, entry in enumerate(content["frames"]):
         frame = _Frame(path, number, entry, content)
         if frame.name in frames:
             raise frame.error("file_path", f"that of frame {frames[frame.name].number} again", "one frame per image")
         frames[frame.name] = frame
-    if hold_out > len(frames):
-        raise ManifestError(f"hold-out: found {hold_out}, but there are {len(frames)} frames. Give a smaller number.")
+    require_hold_out(hold_out, split, len(frames))
+    trained = _named(content, "train_filenames") or {frame.listed for frame in frames.values()} - held
     for index, name in enumerate(sorted(frames)):
-        draft = drafts[1 if hold_out and index % hold_out == hold_out - 1 else 0]
-        pose = posed_camera(frames[name].world_from_named(), axes, unit_m or 1.0)
+        frame = frames[name]
+        is_query = frame.listed in held if own_split else hold_out and index % hold_out == hold_out - 1
+        draft = drafts[1 if is_query else 0]
         try:
-            draft.add(name, frames[name].camera(), pose)
-        except ImageError as error:
+            if own_split and frame.listed not in held | trained:
+                raise CaptureError("it is in none of train_filenames, val_filenames and test_filenames")
+            world_from_named = frame.world_from_named()
+            if undo_applied:
+                world_from_named = _undone(world_from_named, *applied)
+            draft.add(name, frame.camera(), posed_camera(world_from_named, axes, unit_m or 1.0))
+        except (ImageError, CaptureError) as error:
             draft.rows.append({"image": name, "status": str(error)})
     folders = {PurePosixPath(name).parent for name in frames}
     files = [file for folder in folders for file in (path.parent / folder).glob("*")]
@@ -88,20 +108,27 @@ def import_transforms(
     not_in_file = images - set(frames)
     if not_in_file:
         drafts[0].notes.append(f"{len(not_in_file)} images beside these are not in {path.name}")
+    if own_split:
+        drafts[0].notes.append("map and queries: train_filenames, and val_filenames and test_filenames of the file")
+    elif held and split == "map":
+        drafts[0].notes.append(f"val_filenames and test_filenames ({len(held)} images) of the file are not used")
+    if found := sum(frame.from_elsewhere for frame in frames.values()):
+        drafts[0].notes.append(f"{found} images have paths of another machine: their ends are in this folder")
+    turn, scale = applied
+    if not (np.array_equal(turn, np.eye(4)) and scale == 1):
+        world = "that of the file's input" if undo_applied else "the file's, turned from that of its input"
+        other = "" if undo_applied else ". For the input's, as of a COLMAP model beside it, give --undo-applied"
+        drafts[0].notes.append(f"applied_transform, applied_scale {scale:g}: the world is {world}{other}")
     for draft in drafts:
-        if unit_m is None:
-            draft.unit = None
-            draft.notes.append(
-                "unit of the poses: not known. If you know its length in meters, give --unit METERS (1 if a phone's "
-                "tracking or a scanner gave the poses). Lengths are otherwise relative to the depth of the scene"
-            )
+        draft.match_names = match_names
+        draft.note_unit(unit_m)
     return write_drafts(*drafts)
 
 
 def _read(path: Path) -> dict[str, Any]:
     expected = "Expected a transforms.json of nerfstudio or instant-ngp: an object with a list `frames`."
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_bytes())  # also UTF-16, and with a byte-order mark
     except (OSError, ValueError, RecursionError) as error:
         raise CaptureError(f"{path}: cannot be read ({error}). {expected}") from None
     frames = content.get("frames") if isinstance(content, dict) else None
@@ -112,6 +139,38 @@ def _read(path: Path) -> dict[str, Any]:
     return content
 
 
+def _named(content: Mapping[str, Any], *keys: str) -> set[str]:
+    """Return the images in lists of the file, as they are written there."""
+    lists = (content.get(key) for key in keys)
+    return {name for names in lists if isinstance(names, list) for name in names if isinstance(name, str)}
+
+
+def _applied(path: Path, content: Mapping[str, Any]) -> tuple[Floats, float]:
+    """Return applied_transform (4, 4) and applied_scale; the identity and 1 if they are missing.
+
+    Raises:
+        CaptureError: they are not a rigid motion and a positive number.
+    """
+    scale, rows = content.get("applied_scale", 1.0), content.get("applied_transform", np.eye(4))
+    try:
+        matrix = np.vstack([np.array(rows, np.float64)[:3], [0.0, 0.0, 0.0, 1.0]])
+        rotation = matrix[:3, :3]
+        if not (np.abs(rotation.T @ rotation - np.eye(3)).max() <= TOLERANCE and 0 < float(scale) < np.inf):
+            raise ValueError
+    except (TypeError, ValueError, IndexError):
+        found = f"found {rows!r}"[:80] + f" and {scale!r}"[:40]
+        expected = "expected 3 rows of 4 numbers, a rotation and a translation, and a positive number"
+        raise CaptureError(f"{path}: applied_transform, applied_scale: {found}; {expected}.") from None
+    return matrix, float(scale)
+
+
+def _undone(pose: Floats, applied: Floats, scale: float) -> Floats:
+    """Return a pose (4, 4) as it was before `applied`, and then `scale`, were applied to its world."""
+    pose = pose.copy()
+    pose[:3, 3] /= scale
+    return np.asarray(np.linalg.inv(applied) @ pose)
+
+
 class _Frame:
     """One image of the file. Its own values override those at the top level."""
 
@@ -120,11 +179,18 @@ class _Frame:
         image = entry.get("file_path")
         if not isinstance(image, str) or not image.strip() or re.search("[\ud800-\udfff]", image):
             raise self.error("file_path", repr(image)[:80], "the path of an image, relative to the folder of this file")
+        self.listed, self.from_elsewhere = image, False
         self.name = self._with_suffix(image.replace("\\", "/"))
 
     def _with_suffix(self, image: str) -> str:
         """Return an image's path relative to the folder of the file, with its extension added if it is missing."""
+        is_absolute = re.match(r"/|[A-Za-z]:/", image) is not None
         name = os.path.normpath(os.path.relpath(image, self.path.parent) if image.startswith("/") else image)
+        parts = PurePosixPath(image).parts
+        if is_absolute and not is_file(self.path.parent / name):  # of another machine
+            tails = ("/".join(parts[start:]) for start in range(1, len(parts)))
+            tail = next((tail for tail in tails if is_file(self.path.parent / tail)), None)
+            self.from_elsewhere, name = tail is not None, tail or name
         suffixes = ["", *IMAGE_SUFFIXES, *map(str.upper, IMAGE_SUFFIXES)]
         name = next((name + suffix for suffix in suffixes if is_file(self.path.parent / (name + suffix))), name)
         return Path(name).as_posix()

@@ -138,11 +138,30 @@ def _parse_yaml(text: str) -> Any:
             return None
         if _size(node, {}) > MOST_VALUES:
             raise yaml.YAMLError(f"Its aliases expand to more than {MOST_VALUES:,} values.")
+        _require_single_keys(node, set())
         return loader.construct_document(node)
     except RecursionError:
         raise yaml.YAMLError("It is nested too deeply, or an alias contains itself.") from None
     except (ValueError, LookupError, AttributeError, TypeError) as error:  # 2024-99-99, or !!int of no number
         raise yaml.YAMLError(f"A value does not fit its type ({error}).") from None
+
+
+def _require_single_keys(node: yaml.Node, seen: set[int]) -> None:
+    """Raise YAMLError if a mapping has a key twice: PyYAML silently takes the last."""
+    if id(node) in seen or not isinstance(node, yaml.CollectionNode):
+        return
+    seen.add(id(node))
+    if isinstance(node, yaml.MappingNode):
+        first: dict[tuple[str, str], yaml.Node] = {}
+        for key, value in node.value:
+            plain = isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge"
+            if plain and (other := first.setdefault((key.tag, key.value), key)) is not key:
+                found = f"The key {key.value!r} is there twice, first in line {other.start_mark.line + 1}"
+                raise yaml.MarkedYAMLError(problem=f"{found}; keep one of them", problem_mark=key.start_mark)
+            _require_single_keys(value, seen)
+    else:
+        for value in node.value:
+            _require_single_keys(value, seen)
 
 
 def _size(node: yaml.Node, sizes: dict[int, int]) -> int:

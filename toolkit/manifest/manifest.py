@@ -17,6 +17,7 @@ from toolkit.manifest.settings import (
     Positive,
     RerankSettings,
     RetrieveSettings,
+    Seed,
     SequenceSettings,
     Settings,
     Share,
@@ -38,7 +39,7 @@ class DemoData(Settings):
     """Number of rooms to render."""
     frames: Annotated[int, Field(ge=2)] = 12
     """Frames per room of each map session; query sessions have half as many."""
-    seed: Natural = 0
+    seed: Seed = 0
     """Random seed; each seed renders a different place."""
     alike: bool = False
     """Make the last room look exactly like the first."""
@@ -161,7 +162,7 @@ class Manifest(Settings):
     """List of [map device, query device] pairs to run; all: every map session with every query session."""
     queries: str = "keyframes_pruned_subsampled"
     """Keyframes to localize: the name of a list in proc/ of the query sessions; `all`: every device pose known."""
-    seed: Natural = 0
+    seed: Seed = 0
     """Random seed of all stages. The same seed gives the same poses."""
     world_up: Direction | None = None
     """Up direction of the captures' world, three numbers; null: estimate it from the map's camera poses if needed."""

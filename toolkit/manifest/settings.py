@@ -18,6 +18,7 @@ from toolkit.models.compute import DEVICE_NAME
 
 Positive = Annotated[int, Field(gt=0)]
 Natural = Annotated[int, Field(ge=0)]
+Seed = Annotated[int, Field(ge=0, lt=2**31)]  # COLMAP and FAISS take 32 bits
 PositiveNumber = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 ComputeDevice = Annotated[str, Field(pattern=f"^({DEVICE_NAME})$")]
@@ -184,7 +185,7 @@ class EmbedSettings(Settings):
     """Scale descriptors to unit length."""
     dtype: Literal["float32", "float16"] = "float32"
     """Number type of the descriptors in the .npy files."""
-    seed: Natural = 0
+    seed: Seed = 0
     """Random seed for learning the vocabulary."""
     world_up: Direction | None = None
     """Up direction of the map's world, three numbers; null: estimate it from the map's camera poses."""
@@ -350,7 +351,7 @@ class RerankSettings(Settings):
     """Device of the networks: auto, cpu, cuda, cuda:<number> or mps."""
     dtype_compute: Precision = "auto"
     """Precision of the networks; auto: a fast one for the device."""
-    seed: Natural = 0
+    seed: Seed = 0
     """Random seed of RANSAC. The same seed gives the same order."""
     world_up: Direction | None = None
     """Up direction of the map's world, three numbers, for learned features; null: estimate it from the map's camera
@@ -478,7 +479,7 @@ class LocalizeSettings(Settings):
     """Device of the networks: auto, cpu, cuda, cuda:<number> or mps."""
     dtype_compute: Precision = "auto"
     """Precision of the networks; auto: a fast one for the device."""
-    seed: Natural = 0
+    seed: Seed = 0
     """Random seed of RANSAC. The same seed gives the same poses for any number of threads."""
     world_up: Direction | None = None
     """Up direction of the map's world, three numbers; null: estimate it from the map's camera poses."""

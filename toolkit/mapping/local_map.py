@@ -59,6 +59,8 @@ class Consistency:
             cause = f"They would agree with: {self.fits}." if self.fits else (
                 "No usual convention fits: do the poses, names and intrinsics belong to these images?"
             )  # fmt: skip
+            if self.fits.startswith(("rotations of cam_from_world", "camera centers that were")):
+                cause += " If imported from a table: give `--poses-are rotation_of_cam_from_world`."
             if OPENGL_AXES in self.fits:
                 cause += " If imported: give the other `--axes`, opencv or opengl, to `python -m toolkit import`."
             agree = f"{self.agreeing} of {self.pairs} image pairs with verified matches agree with the poses"

@@ -41,6 +41,7 @@ of a degree, poses in another convention tens of degrees."""
 MIN_PARALLAX_DEG = 0.5  # least angle between two rays that tells whether their point is in front of the cameras
 MAX_ROTATION_ERROR_DEG = 5.0
 """Largest median difference between the relative rotations of poses and matches under a convention that fits."""
+INVERTED = "camera centers that were inverted with the rotations"
 MAX_TRIED = 12  # number of pairs that conventions are tried with, those with the most matches
 CLEAR = 0.75  # share of agreeing pairs from which no further convention is tried
 COARSE_DEG = 3.0  # largest median error of correct but coarse poses
@@ -337,13 +338,16 @@ def _conventions(
         j_from_i = np.swapaxes(world_from_cams[j], 1, 2) @ world_from_cams[i]
         if np.median(geometry.rotation_angle_deg(np.swapaxes(j_from_i, 1, 2) @ matched)) > MAX_ROTATION_ERROR_DEG:
             continue
-        # The stated position is the camera center, or the translation of cam_from_world.
-        for translations, A in product((0, 1), signed_axes):
-            centers = -(R @ positions[..., None])[..., 0] if translations else positions
+        # The stated position is the camera center, the translation of cam_from_world, or a center that was turned as
+        # if it were one.
+        turned = np.swapaxes(R, 1, 2)
+        places = (positions, -(R @ positions[..., None])[..., 0], -(turned @ positions[..., None])[..., 0])
+        for translations, A in product((0, 1) if inverse else (0, 1, 2), signed_axes):
+            centers = places[translations]
             # Mirroring world and cameras along one axis gives rotations about other axes, and negated positions.
             mirrored = np.trace(X) == -1 and np.array_equal(X, np.diag(np.diag(X))) and np.array_equal(A, -np.eye(3))
             moved = not mirrored and not np.array_equal(A, np.eye(3))
-            direction = ("", "translations", "rotations", "poses")[2 * inverse + translations]
+            direction = (("", "translations", INVERTED), ("rotations", "poses"))[inverse][translations]
             texts = [
                 f"{direction} of cam_from_world" if direction else "",
                 rigs_text,

@@ -72,9 +72,13 @@ def _tracks(
     for index, (name, camera, cam_from_world, xy) in enumerate(
         zip(names, cameras, geometry.invert(world_from_cams), keypoints, strict=True), start=1
     ):
-        camera = pycolmap.Camera(camera.todict() | {"camera_id": index})
+        camera, xy = pycolmap.Camera(camera.todict() | {"camera_id": index}), np.asarray(xy, np.float64)
+        center, size = [camera.principal_point_x, camera.principal_point_y], [camera.width, camera.height]
+        if np.any(np.less(center, 0) | np.greater(center, size)):  # of a crop; COLMAP silently ignores such cameras
+            xy = xy + np.subtract(np.array(size) / 2, center)
+            camera.principal_point_x, camera.principal_point_y = camera.width / 2, camera.height / 2
         reconstruction.add_camera_with_trivial_rig(camera)
-        image = pycolmap.Image(name=name, camera_id=index, image_id=index, keypoints=np.asarray(xy, np.float64))
+        image = pycolmap.Image(name=name, camera_id=index, image_id=index, keypoints=xy)
         reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(cam_from_world[:3]))
         graph.add_image(index, len(xy))
     for (i, j), indices in zip(pairs, matches, strict=True):
@@ -89,6 +93,8 @@ def _tracks(
     triangulator = pycolmap.IncrementalTriangulator(graph, reconstruction, observations)
     options = pycolmap.IncrementalTriangulatorOptions()
     options.random_seed = seed
+    # COLMAP silently ignores cameras beyond these limits, among them calibrated ones: Azure Kinect's has k > 1.
+    options.min_focal_length_ratio, options.max_focal_length_ratio, options.max_extra_param = 0.0, np.inf, np.inf
     options.ignore_two_view_tracks = False
     options.min_angle = settings.min_triangulation_angle_deg
     for index in range(1, len(names) + 1):

@@ -22,7 +22,7 @@ from toolkit.store.hdf5 import HDF5_ERRORS
 SETTINGS, SESSIONS_ROOT, RETRIEVAL = "settings", "sessions_root", "retrieval_dir"
 """Attributes of `poses/<pair>.h5`: the settings that the pair was localized with, the `sessions` folder of the capture,
 and the folder of the references."""
-_FIRST = "Localize first: python -m toolkit run MANIFEST."
+_FIRST = "Localize first: python -m toolkit run MANIFEST, or build the map alone: add --only map."
 
 
 def no_such_run(run: Path) -> ArtifactError:
@@ -43,7 +43,7 @@ def localized_scenes(run: Path) -> list[str]:
 
 
 def pairs_in_map(files: SceneFiles, device: str) -> list[Path]:
-    """Return `poses/<pair>.h5` of all pairs with a map device.
+    """Return `poses/<pair>.h5` of all pairs with a map device; of a map without queries, its own file.
 
     Raises:
         ArtifactError: unknown run, scene or device; the message lists the known ones.
@@ -51,11 +51,25 @@ def pairs_in_map(files: SceneFiles, device: str) -> list[Path]:
     if files.scene not in (scenes := localized_scenes(files.run)):
         known = nearest(files.scene, scenes)
         raise ArtifactError(f"{files.run}: no poses of the scene {files.scene!r}. {known} {_FIRST}")
-    pairs = {path: pair_devices(path.stem)[0] for path in sorted(files.poses_dir.glob("*.h5"))}
-    if device not in pairs.values():
-        known = nearest(device, set(pairs.values()))
-        raise ArtifactError(f"{files.poses_dir}: no poses of queries in the map of {device!r}. {known} {_FIRST}")
-    return [path for path, mapped in pairs.items() if mapped == device]
+    maps = opened_by(files)
+    if device not in maps:
+        known = nearest(device, maps)
+        raise ArtifactError(f"{files.poses_dir}: no map of {device!r}. {known} {_FIRST}")
+    return maps[device]
+
+
+def opened_by(files: SceneFiles) -> dict[str, list[Path]]:
+    """Return for each map device the files that say how its map is opened: `<pair>.h5`, or of a map without queries
+    `<scene>_map_<device>.h5`."""
+    found: dict[str, list[Path]] = {}
+    paths = sorted(files.poses_dir.glob("*.h5"))
+    for path in paths:
+        if device := pair_devices(path.stem)[0]:
+            found.setdefault(device, []).append(path)
+    for path in paths:
+        if not pair_devices(path.stem)[0]:
+            found.setdefault(path.stem.rpartition("_map_")[2], [path])
+    return found
 
 
 Localized = tuple[LocalizeSettings, dict[str, Any], list[str]]

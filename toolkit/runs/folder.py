@@ -19,11 +19,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
+from filelock import SoftFileLock
 
 from toolkit import __version__
 from toolkit.errors import ToolkitError, exit_code, sentence
-from toolkit.files import environment_variable, is_left_over, read_json, sweep_partials, write_text
+from toolkit.files import environment_variable, is_left_over, read_json, sweep_partials, try_lock, write_text
 from toolkit.manifest import STAGES, Manifest
 
 log = logging.getLogger(__name__)
@@ -47,17 +47,24 @@ def held(run_dir: Path) -> Iterator[None]:
         ToolkitError: another run holds the lock; the message names its process, host and start.
     """
     run_dir.mkdir(parents=True, exist_ok=True)
-    lock, holder = FileLock(run_dir / ".run.lock"), run_dir / ".run.lock.json"
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
+    holder = run_dir / ".run.lock.json"
+    lock, acquired = try_lock(run_dir / ".run.lock")
+    only_marked = isinstance(lock, SoftFileLock)
+    if not acquired:
         other = read_json(holder)
         who = f"process {other.get('pid', '?')} on {other.get('host', '?')}, since {other.get('since', '?')}"
         do = "Wait until it ends, stop it, or write this run to another folder (--set output_root=FOLDER)."
-        raise ToolkitError(f"{run_dir}: another run is using this folder: {who}. {do}") from None
+        if only_marked:
+            do += f" If it no longer runs, delete {lock.lock_file}: this file system has no locks, so a kill leaves it."
+        raise ToolkitError(f"{run_dir}: another run is using this folder: {who}. {do}")
     try:
         me = {"pid": os.getpid(), "host": socket.gethostname()}
         with log_to(run_dir / LOG), environment_variable(LOG_VARIABLE, str((run_dir / LOG).absolute())):
+            if only_marked:
+                log.warning(
+                    "The file system of %s has no locks: %s marks that a run uses it, and stays if the run is killed.",
+                    run_dir, lock.lock_file,
+                )  # fmt: skip
             if before := read_json(holder):
                 log.warning("The run of process %s on %s was killed.", before.get("pid"), before.get("host"))
             write_text(holder, json.dumps(me | {"since": datetime.now().isoformat(" ", "seconds")}) + "\n")

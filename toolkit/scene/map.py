@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from tqdm.auto import tqdm
 
 from toolkit import geometry
 from toolkit.capture import Capture, Session, masks
 from toolkit.capture.images import thumbnails
 from toolkit.capture.upright import Turns, upright_turns
-from toolkit.errors import ArtifactError, CameraError, ManifestError
+from toolkit.errors import ArtifactError, CameraError, ImageError, ManifestError, reason_of
 from toolkit.features.features import KINDS
 from toolkit.features.matching import (
     AnyMethod,
@@ -68,7 +69,7 @@ from toolkit.results.opening import (
 )  # fmt: skip
 from toolkit.results.pair import find_query
 from toolkit.scene.located import Located, Retrieved, ranks, show_matches
-from toolkit.scene.query import Image, guessed_camera, query_from, with_focal
+from toolkit.scene.query import Image, camera_key, guessed_camera, query_from, with_focal
 from toolkit.scene.search import ReferenceSearch
 from toolkit.threads import fixed_sums
 
@@ -84,7 +85,8 @@ WITHOUT_FEATURES = ("feed_forward", "nearest")
 """Methods that need no local features of the queries."""
 MAP_CAMERAS = 1000  # cameras of the map among which that of an image of equal size is looked for, at most
 FOCAL_STEPS, FOCAL_DOUBT = 3, 1.3
-"""Steps of the estimate of an unknown focal length, and the factor of one that the matches must contradict."""
+"""Steps of the estimate of an unknown focal length; the matches must contradict one that is larger or smaller by a
+factor."""
 FIXED_BY_MAP = ("unit", "world_up")
 """Settings that the length of the map and the turns of its images depend on, so they cannot change for a query."""
 ODD_DEPTHS_M = (0.1, 200.0)
@@ -717,35 +719,89 @@ def localize_image(
     if camera is None:
         if rig_from_cams is not None or isinstance(image, list | tuple):
             raise CameraError("camera: found None for several images, expected a camera for each.")
-        return _with_unknown_focal(scene_map, image, turns, near)
+        return _UnknownFocal(scene_map, image, turns, near).estimate()[0]
     return scene_map.locate(scene_map.query(image, camera, rig_from_cams, turns), near)
 
 
-def _with_unknown_focal(
-    scene_map: Map, image: Image, turns: Sequence[int] | None, near: RoughPose | None
-) -> QueryResult:
-    """Localize an image without a camera, again with the focal length that fits its matches, until none fits better."""
-    sensors = scene_map.session.sensors
-    ids = sensors.loc[sensors["sensor_type"] == "camera", "sensor_id"].head(MAP_CAMERAS)
-    camera, origin = guessed_camera(image, [scene_map.session.camera(str(name)) for name in ids])
+def localize_images(
+    scene_map: Map, images: Sequence[Image], camera: pycolmap.Camera | None = None
+) -> list[QueryResult]:
+    """Localize images, each alone, as `localize_image` does. Without a camera, images of one camera help each other.
 
-    def locate(focal_px: float) -> QueryResult:
-        return scene_map.locate(scene_map.query(image, with_focal(camera, focal_px), None, turns), near)
+    Those with equal size, and in EXIF equal camera and focal length, are of one camera. The median of the focal lengths
+    that matches of its `ok` images tell, weighted by inliers, is tried for the other images.
 
-    focal_px = camera.mean_focal_length()
-    result = locate(focal_px)
-    told = False
-    for _ in range(FOCAL_STEPS):
-        fitting = result.focals_px[0] if result.focals_px else np.nan
-        if not np.isfinite(fitting):
-            break
-        focal_px, told = float(fitting), True
-        result = locate(focal_px)
-    text = f"focal length {focal_px:.0f} px, {'which fits its matches' if told else origin}"
-    if result.status == Status.OK and not told and not locate(FOCAL_DOUBT * focal_px).misfit:
-        result = replace(result, status=Status.LOW_CONFIDENCE, reason=CAMERA)
-        text += ", and the matches do not tell it"
-    return replace(result, remark="; ".join(filter(None, [text, result.remark])))
+    Returns:
+        One result per image. If an image cannot be read or does not fit the camera, it is `failed`, with the reason.
+
+    Raises:
+        ArtifactError: see `localize_image`.
+    """
+    results, cameras = list[QueryResult](), dict[Any, list[tuple[int, _UnknownFocal, float | None]]]()
+    for number, image in enumerate(tqdm(images, "localize", unit="image", disable=len(images) < 2)):
+        try:
+            if camera is not None:
+                results.append(localize_image(scene_map, image, camera))
+                continue
+            unknown = _UnknownFocal(scene_map, image)
+            result, told_px = unknown.estimate()
+            results.append(result)
+            sure_px = told_px if result.status is Status.OK else None
+            cameras.setdefault(camera_key(image, unknown.camera), []).append((number, unknown, sure_px))
+        except ImageError as error:
+            results.append(QueryResult.failed(reason_of(error, f"localizing {image}")))
+    for of_camera in cameras.values():
+        sure = sorted((sure_px, number) for number, _, sure_px in of_camera if sure_px is not None)
+        if not sure:
+            continue
+        inliers = np.cumsum([results[number].num_inliers for _, number in sure])
+        focal_px, _ = sure[np.searchsorted(inliers, inliers[-1] / 2)]
+        for number, unknown, sure_px in of_camera:
+            if sure_px is not None:
+                continue
+            result = unknown.locate(focal_px)
+            if result.status.rank >= results[number].status.rank and not result.misfit:
+                text = f"focal length {focal_px:.0f} px, from {len(sure)} other photographs of its camera"
+                results[number] = replace(result, remark="; ".join(filter(None, [text, result.remark])))
+    return results
+
+
+class _UnknownFocal:
+    """An image in a map, without a camera."""
+
+    def __init__(
+        self, scene_map: Map, image: Image, turns: Sequence[int] | None = None, near: RoughPose | None = None
+    ) -> None:
+        self.scene_map, self.image, self.turns, self.near = scene_map, image, turns, near
+        sensors = scene_map.session.sensors
+        ids = sensors.loc[sensors["sensor_type"] == "camera", "sensor_id"].head(MAP_CAMERAS)
+        known = [scene_map.session.camera(str(name)) for name in ids]
+        self.camera, self.origin = guessed_camera(image, known)
+
+    def locate(self, focal_px: float) -> QueryResult:
+        query = self.scene_map.query(self.image, with_focal(self.camera, focal_px), None, self.turns)
+        return self.scene_map.locate(query, self.near)
+
+    def estimate(self) -> tuple[QueryResult, float | None]:
+        """Localize again with the focal length that fits the matches, until none fits better.
+
+        Returns:
+            The result, and the focal length in pixels; None if the matches do not contradict the guess.
+        """
+        focal_px, told = self.camera.mean_focal_length(), False
+        result = self.locate(focal_px)
+        for _ in range(FOCAL_STEPS):
+            fitting = result.focals_px[0] if result.focals_px else np.nan
+            if not np.isfinite(fitting):
+                break
+            focal_px, told = float(fitting), True
+            result = self.locate(focal_px)
+        text = f"focal length {focal_px:.0f} px, {'which fits its matches' if told else self.origin}"
+        others = (focal_px * FOCAL_DOUBT, focal_px / FOCAL_DOUBT)
+        if result.status == Status.OK and not told and not all(self.locate(other).misfit for other in others):
+            result = replace(result, status=Status.LOW_CONFIDENCE, reason=CAMERA)
+            text += ", and the matches do not tell it"
+        return replace(result, remark="; ".join(filter(None, [text, result.remark]))), focal_px if told else None
 
 
 def needs_upright(settings: LocalizeSettings, kinds: Sequence[AnyMethod]) -> bool:

@@ -10,7 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from toolkit.capture.cameras import camera_text, parse_camera
-from toolkit.capture.images import exif_camera, find_mask, stored_size
+from toolkit.capture.images import exif_camera, exif_key, find_mask, read_header, stored_size
 from toolkit.errors import CameraError, ImageError
 from toolkit.pose.base import Query, View
 
@@ -118,6 +118,12 @@ def guessed_camera(image: Image, known: Sequence[pycolmap.Camera]) -> tuple[pyco
     params = [FOCAL_PRIOR * max(width, height), width / 2, height / 2]
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
     return camera, f"a guess, {FOCAL_PRIOR:g} times the longer side"
+
+
+def camera_key(image: Image, camera: pycolmap.Camera) -> tuple[Any, ...]:
+    """Return what images of one camera have in common: size, and what EXIF says of the camera."""
+    exif = read_header(Path(image))[1] if isinstance(image, str | Path) else {}
+    return camera.width, camera.height, *exif_key(exif)
 
 
 def with_focal(camera: pycolmap.Camera, focal_px: float) -> pycolmap.Camera:

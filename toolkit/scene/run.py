@@ -17,7 +17,7 @@ from toolkit.files import SceneFiles, pair_devices, read_json
 from toolkit.geometry import Ints
 from toolkit.pose.base import Query
 from toolkit.pose.result import QueryResult, statuses
-from toolkit.results.opening import SESSIONS_ROOT, how_localized, localized_scenes, no_such_run
+from toolkit.results.opening import SESSIONS_ROOT, how_localized, localized_scenes, no_such_run, opened_by
 from toolkit.results.pair import PairResults, find_query, pairs_of
 from toolkit.runs.folder import RECORD
 from toolkit.scene.map import Map
@@ -77,18 +77,17 @@ class Run:
 
     @cached_property
     def scenes(self) -> list[str]:
-        """Names of the captures that were localized."""
+        """Names of the captures that were localized, or whose maps were built."""
         return localized_scenes(self.path)
 
     def map(self, device: str | None = None, scene: str | None = None) -> Map:
         """Open the map of a device, see `Map.open`.
 
         Args:
-            device: `ios`, `hl`, `spot`; None: the first that was localized in.
+            device: `ios`, `hl`, `spot`; None: the first that has a map.
             scene: name of the capture; None: the only one of the run.
         """
-        poses = SceneFiles(self.path, self._scene(scene)).poses_dir
-        devices = in_order(pair_devices(path.stem)[0] for path in pairs_of(poses))
+        devices = in_order(opened_by(SceneFiles(self.path, self._scene(scene))))
         return Map.open(self.path, self._scene(scene), device or (devices[0] if devices else "none"))
 
     def _scene(self, scene: str | None) -> str:
