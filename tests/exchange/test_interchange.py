@@ -1,6 +1,7 @@
 """Import: COLMAP models and folders of images become sessions; what cannot be used is said."""
 
 import struct
+import sys
 import zlib
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from typer.testing import CliRunner
 from toolkit.__main__ import app
 from toolkit.capture import Capture, Session
 from toolkit.capture.check import check_capture
-from toolkit.capture.images import exif_camera, read_number
+from toolkit.capture.images import exif_camera, read_image, read_number
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.interchange import import_colmap, import_images
 from toolkit.geometry import invert, make_pose, pose_from_qt, qt_from_pose, quaternion_to_rotation
@@ -399,7 +400,10 @@ def test_names_that_fit_two_files_are_not_guessed(tmp_path: Path) -> None:
     assert report.images.set_index("image")["status"].to_dict() == {"Img.jpg": "no such file", "good.jpg": "imported"}
 
 
-def test_files_that_are_not_photographs_are_said(folder: Path, tmp_path: Path) -> None:
+def test_files_that_are_not_photographs_are_said(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
     for name in ("x.heic", "y.HEIC", "z.gif"):
         (folder / name).write_bytes(b"anything")
     (folder / "caf\udce9.jpg").write_bytes(b"not Unicode")
@@ -411,6 +415,27 @@ def test_files_that_are_not_photographs_are_said(folder: Path, tmp_path: Path) -
     assert "2 files .heic are not read: pip install" in text
     assert "1 files .gif are not read" in text
     assert "1 images have a name that is not UTF-8" in text
+    assert check_capture(tmp_path / "PLACE", deep=True).problems == []
+
+
+@pytest.mark.parametrize(("size", "said"), [((62, 47), "cropped"), ((32, 24), "by 0.5"), ((128, 96), "by 2")])
+def test_a_crop_is_not_a_smaller_image(size: tuple[int, int], said: str, tmp_path: Path) -> None:
+    save(tmp_path / "photos" / "a.jpg", size)
+    save(tmp_path / "photos" / "b.jpg")
+    status = import_images(tmp_path / "photos", tmp_path / "PLACE", camera=CAMERA).images.set_index("image")["status"]
+    assert said in status["a.jpg"]
+    assert ("multiply" in status["a.jpg"]) == (said != "cropped")
+
+
+def test_heic_is_read_with_its_package(folder: Path, tmp_path: Path) -> None:
+    pillow_heif = pytest.importorskip("pillow_heif")
+    pillow_heif.register_heif_opener()
+    shade = np.tile(np.arange(0, 256, 4, dtype=np.uint8), (48, 1))
+    PIL.Image.fromarray(np.stack([shade] * 3, axis=-1)).save(folder / "p.HEIC", quality=95)
+    report = import_images(folder, tmp_path / "PLACE", camera=CAMERA)
+    assert "p.HEIC.png" in set(report.images["image"])
+    path = tmp_path / "PLACE" / "sessions" / "ios_query" / "raw_data" / "import" / "images" / "p.HEIC.png"
+    assert np.abs(read_image(path, gray=True).astype(int) - shade).max() < 16
     assert check_capture(tmp_path / "PLACE", deep=True).problems == []
 
 

@@ -8,7 +8,7 @@ import codecs
 import mmap
 import re
 import struct
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -129,14 +129,29 @@ def _no_model(folder: Path, models: Sequence[Path]) -> CaptureError:
 
 
 def _pose(values: Sequence[float]) -> Floats | str:
-    """Return a pose (4, 4) of qw qx qy qz tx ty tz, or why it is none. The quaternion is normalized."""
-    row = np.array(values)
-    if not (np.abs(row) < FARTHEST_M).all():
-        return f"its pose is not finite: {', '.join(f'{value:g}' for value in values)}"
-    norm = float(np.linalg.norm(row[:4]))
-    if abs(norm - 1) > NORM_TOLERANCE:
-        return f"its quaternion has the length {norm:.4g}, expected 1"
-    return pose_from_qt(np.r_[row[:4] / norm, row[4:]])
+    return _poses([values])[0]
+
+
+def _poses(rows: Sequence[Sequence[float]]) -> list[Floats | str]:
+    """Return the pose (4, 4) of each row qw qx qy qz tx ty tz, or why it is none. Quaternions are normalized."""
+    table = np.array(rows, np.float64).reshape(-1, 7)
+    finite = np.all(np.abs(table) < FARTHEST_M, axis=1)
+    lengths = np.linalg.norm(np.where(finite[:, None], table[:, :4], 0.0), axis=1)
+    valid = np.abs(lengths - 1) <= NORM_TOLERANCE
+    poses: list[Floats | str] = [f"its quaternion has the length {length:.4g}, expected 1" for length in lengths]
+    for index in np.flatnonzero(~finite).tolist():
+        poses[index] = f"its pose is not finite: {', '.join(f'{value:g}' for value in rows[index])}"
+    for index, pose in zip(np.flatnonzero(valid).tolist(), pose_from_qt(table[valid]), strict=True):
+        poses[index] = pose
+    return poses
+
+
+def _set_images(model: ColmapModel, rows: Mapping[int, tuple[str, int, Sequence[float]]]) -> None:
+    """Set the images of a model: name, camera and pose by id. All poses are converted at once, which is faster."""
+    for (image_id, (name, camera_id, _)), pose in zip(
+        rows.items(), _poses([values for _, _, values in rows.values()]), strict=True
+    ):
+        model.images[image_id] = ModelImage(name, camera_id, pose)
 
 
 def _camera(
@@ -202,7 +217,7 @@ def _text_cameras(path: Path, model: ColmapModel) -> None:
 
 def _text_images(path: Path, model: ColmapModel) -> None:
     expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of points"
-    points_follow, without_points = False, 0
+    points_follow, without_points, rows = False, 0, dict[int, tuple[str, int, Sequence[float]]]()
     for number, line in _lines(path):
         words = line.split(maxsplit=9)
         is_image = _is_image(words)
@@ -214,11 +229,11 @@ def _text_images(path: Path, model: ColmapModel) -> None:
                 values, image_id, camera_id = [float(word) for word in words[1:8]], int(words[0]), int(words[8])
             except ValueError:
                 raise _malformed(path, number, line, expected) from None
-            image_id = _new(path, "image", image_id, model.images)
-            model.images[image_id] = ModelImage(words[9], camera_id, _pose(values))
+            rows[_new(path, "image", image_id, rows)] = words[9], camera_id, values
             points_follow = True
         elif line:
             raise _malformed(path, number, line, expected)
+    _set_images(model, rows)
     if without_points:
         model.notes.append(f"{path.name}: {without_points} images have no line of points, which is not needed")
     with path.open(encoding=encoding_of(path), errors="replace") as file:
@@ -343,12 +358,13 @@ def _binary_cameras(path: Path, model: ColmapModel) -> None:
 
 
 def _binary_images(path: Path, model: ColmapModel) -> None:
-    file = _Binary(path)
+    file, rows = _Binary(path), dict[int, tuple[str, int, Sequence[float]]]()
     for _ in file:
         image_id, *values, camera_id = file.read("I7dI")
-        model.images[_new(path, "image", image_id, model.images)] = ModelImage(file.name(), camera_id, _pose(values))
+        rows[_new(path, "image", image_id, rows)] = file.name(), camera_id, values
         (points,) = file.read("Q")
         file.skip(24 * points)
+    _set_images(model, rows)
 
 
 def _binary_rigs(path: Path, model: ColmapModel) -> None:

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import PIL.Image
 import pycolmap
 
 from toolkit.capture import RAW_DATA, Trajectory, write_session
@@ -225,6 +226,10 @@ class Draft:
             self.notes.append(f"distortion that cannot be inverted near the edge of the image: {of}")
         self.rows += [{"image": name, "status": problem} for name, problem in problems.items() if problem]
         self.images = [image for image in self.images if not problems[image.name]]
+        for image in self.images:
+            if image.name.lower().endswith(HEIC_SUFFIXES):  # OpenCV cannot read it
+                self.sources[f"{image.name}.png"] = self.source(image.name)
+                image.name = f"{image.name}.png"
         if not self.images:
             name, status = (self.rows[0]["image"], self.rows[0]["status"]) if self.rows else ("", "there is none")
             where = " Names are paths in this folder: correct them in the list, or put the list beside the images."
@@ -281,7 +286,10 @@ class Draft:
             files += [(path, session / MASKS / f"{IMPORTED}{name}.png") for name, path in masks.items()]
             for source, target in files:
                 target.parent.mkdir(parents=True, exist_ok=True)
-                if self.placing == "copy":
+                if source.name.lower().endswith(HEIC_SUFFIXES):
+                    with PIL.Image.open(source) as picture:
+                        picture.convert("RGB").save(target, exif=picture.getexif())
+                elif self.placing == "copy":
                     shutil.copyfile(source, target)
                 else:
                     target.symlink_to(os.path.abspath(source))  # noqa: PTH100 - must not resolve links in the source
@@ -323,6 +331,8 @@ class Draft:
             return NOT_INSIDE
         if is_bad_name(image.name):
             return f"the capture format cannot hold this name, expected {EXPECTED_NAME}"
+        if image.name.lower().endswith(HEIC_SUFFIXES) and not heic_is_read():
+            return f"HEIC is not read: {_HOW[HEIC_SUFFIXES[0]]}"
         try:
             size, exif = read_header(self.source(image.name))
         except ImageError as error:
@@ -339,7 +349,10 @@ class Draft:
         problem = f"the image is stored as {width} x {height} pixels, its camera has {camera.width} x {camera.height}"
         if abs(width * camera.height - height * camera.width) <= max(sides) / 2:  # equal ratio up to rounding
             factor = width / camera.width
-            problem += f"; use images of the camera's size, or multiply its intrinsics by {factor:.6g}"
+            is_crop = 0.9 < factor < 1.1  # nobody resizes by so little; undistortion and stabilization crop
+            problem += "; it seems to be cropped" if is_crop else ""
+            problem += "; use images of the camera's size"
+            problem += "" if is_crop else f", or multiply its intrinsics by {factor:.6g}"
         if 4 < orientation <= 8 and size == (camera.height, camera.width):
             problem += "; the camera fits the rotated image: rotate the pixels and remove the EXIF orientation"
         return problem
@@ -424,8 +437,8 @@ def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES, notes:
     names = sorted((name for name in files if name.lower().endswith(suffixes) and not _is_mask(name)), key=Path)
     broken = [name for name in names if printable(name) != name]
     names = [name for name in names if name not in set(broken)] if broken else names
-    others = Counter(Path(name).suffix.lower() for name in files if name.lower().endswith(PHOTOGRAPHS))
-    others = Counter({suffix: count for suffix, count in others.items() if suffix not in suffixes})
+    suffix_of = (name[name.rfind(".") :].lower() for name in files)
+    others = Counter(suffix for suffix in suffix_of if suffix in PHOTOGRAPHS and suffix not in suffixes)
     said = [f"{count} files {suffix} are not read: {_HOW.get(suffix, CONVERT)}" for suffix, count in others.items()]
     if broken:
         said.append(f"{len(broken)} images have a name that is not UTF-8: rename them; first: {printable(broken[0])}")
@@ -455,8 +468,19 @@ def walk_files(folder: Path) -> tuple[list[str], list[str]]:
                 folders.remove(link)
             else:
                 visited.append(target)
-        names += [Path(root, name).relative_to(folder).as_posix() for name in files]
+        inside = Path(root).relative_to(folder).as_posix()
+        names += files if inside == "." else [f"{inside}/{name}" for name in files]
     return names, captures
+
+
+def heic_is_read() -> bool:
+    """Tell whether Pillow reads HEIC, with the optional package pillow-heif."""
+    try:
+        import pillow_heif
+    except ImportError:
+        return False
+    pillow_heif.register_heif_opener()
+    return True
 
 
 def printable(name: str) -> str:

@@ -28,11 +28,13 @@ from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.colmap_model import NORM_TOLERANCE, encoding_of, is_number, read_cameras, read_model
 from toolkit.exchange.drafts import (
+    HEIC_SUFFIXES,
     READ_SUFFIXES,
     SUBSESSION,
     Draft,
     DraftImage,
     ImportReport,
+    heic_is_read,
     list_images,
     posed_camera,
     require_convention,
@@ -291,7 +293,7 @@ def _sensors_of_rigs(rigs: Mapping[int, Mapping[int, Floats | None]]) -> dict[tu
 
 def _listed(draft: Draft, folder: Path, only: Sequence[str], skip: Sequence[str]) -> list[str]:
     """Return the images of a folder that fit the patterns, and note what is left out or looks like no photograph."""
-    names = list_images(folder, READ_SUFFIXES, draft.notes)
+    names = list_images(folder, (*READ_SUFFIXES, *(HEIC_SUFFIXES if heic_is_read() else ())), draft.notes)
     chosen = [name for name in names if not only or any(_fits(name, pattern) for pattern in only)]
     chosen = [name for name in chosen if not any(_fits(name, pattern) for pattern in skip)]
     if not chosen:
