@@ -145,7 +145,8 @@ def localize(
     import numpy as np
 
     from toolkit.capture import parse_camera
-    from toolkit.errors import CameraError
+    from toolkit.errors import CameraError, CaptureError
+    from toolkit.exchange.georeference import GEO_COLUMNS, geographic_poses, origin_of
     from toolkit.geometry import qt_from_pose
     from toolkit.scene import Run as FinishedRun
     from toolkit.scene import localize_images
@@ -155,6 +156,9 @@ def localize(
     except ValueError as error:
         raise CameraError(f"camera: {error}") from None
     place = FinishedRun.open(run).map(device, scene)
+    origin = None
+    with suppress(CaptureError):
+        origin = origin_of(place.session)
     rows, poses = [], [np.full((4, 4), np.nan)]
     for path, result in zip(photographs, localize_images(place, photographs, given), strict=True):
         row: dict[str, Any] = {"image": str(path), "status": result.status_text, "world_from_cam": None}
@@ -162,6 +166,9 @@ def localize(
         if result.world_from_rig is not None:
             poses.append(result.world_from_rig)
             row |= {"world_from_cam": result.world_from_rig.tolist(), "position_std_m": result.position_std_m}
+            if origin is not None:
+                geo = geographic_poses(poses[-1][None], origin)[0].tolist()
+                row |= {name: None if np.isnan(one) else one for name, one in zip(GEO_COLUMNS, geo, strict=True)}
         rows.append(row)
         if not as_json:
             print(f"{path}: {row['status']}. {row['remark']}".strip())
@@ -169,6 +176,9 @@ def localize(
                 qw, qx, qy, qz, *xyz = qt_from_pose(np.array(row["world_from_cam"])).tolist()
                 print(f"  position {xyz[0]:.3f} {xyz[1]:.3f} {xyz[2]:.3f}, qw qx qy qz "
                       f"{qw:.5f} {qx:.5f} {qy:.5f} {qz:.5f}, {row['inliers']} inliers")  # fmt: skip
+                if origin is not None:
+                    print(f"  latitude {geo[0]:.7f}, longitude {geo[1]:.7f}, altitude {geo[2]:.2f} m, "
+                          f"heading {geo[3]:.1f}, pitch {geo[4]:.1f} degrees")  # fmt: skip
     if picture is not None:
         from toolkit.figures.top_view import draw_scene
 
@@ -365,6 +375,26 @@ def import_images(
     print(report.text())
 
 
+@import_app.command("panoramas")
+def import_panoramas(
+    images: Annotated[Path, Argument(help="Folder of equirectangular JPEG and PNG files, of the whole sphere.")],
+    capture: Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
+    device: Device = "ios",
+    split: Annotated[str, Option(metavar="map|query", help="A map needs a table with poses.")] = "query",
+    table: Annotated[Path | None, Option(help="CSV: image,qw,qx,qy,qz,tx,ty,tz of each panorama.")] = None,
+    poses_are: Annotated[
+        str, Option(metavar="world_from_cam|cam_from_world", help="Direction of the table's poses.")
+    ] = "world_from_cam",
+    axes: Axes = "opencv",
+    unit: Annotated[float, Option(metavar="METERS", help="Meters per unit of the poses, e.g. 0.01.")] = 1.0,
+    masks: Masks = None,
+) -> None:
+    """Make a session of 360-degree panoramas: each becomes a rig of perspective views."""
+    from toolkit.exchange.panoramas import import_panoramas
+
+    print(import_panoramas(images, capture, device, split, table, poses_are, axes, unit, masks).text())
+
+
 @import_app.command("transforms")
 def import_transforms(
     transforms: Annotated[Path, Argument(help="transforms.json of nerfstudio or instant-ngp, near its images.")],
@@ -543,6 +573,31 @@ def export_matches(
     from toolkit.exchange import hloc
 
     print(f"{out}: {hloc.export_matches(run, scene, session0, session1, out, kind)} pairs")
+
+
+_OUT_GEO = "File to write: .csv, or .geojson."
+_OUT_EXIF = "Folder for copies of the pictures."
+
+
+@export_app.command("geo")
+def export_geo(run: Run, out: Annotated[Path, Argument(help=_OUT_GEO)], capture: Capture = None) -> None:
+    """Write latitude, longitude, altitude and heading of the queries of a run in maps with GPS."""
+    from toolkit.exchange import geo
+
+    print(f"{out}: {geo.export_geo(run, out, capture)} images")
+
+
+@export_app.command("exif")
+def export_exif(
+    run: Run,
+    out: Annotated[Path, Argument(help=_OUT_EXIF)],
+    capture: Capture = None,
+    unsure: Annotated[bool, Option("--unsure", help="Also poses of low confidence.")] = False,
+) -> None:
+    """Write position and direction into copies of the query pictures of a run in maps with GPS."""
+    from toolkit.exchange import geo
+
+    print(f"{out}: {geo.export_exif(run, out, capture, unsure)} pictures")
 
 
 @app.command()

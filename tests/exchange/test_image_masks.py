@@ -12,7 +12,7 @@ from toolkit.capture.images import find_mask
 from toolkit.errors import CaptureError, ImageError
 from toolkit.exchange.interchange import import_images
 from toolkit.exchange.photographs import gather
-from toolkit.features.features import unmasked
+from toolkit.features.features import usable
 from toolkit.features.matching import create_local_methods, resolve_auto
 from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import extract_session
@@ -103,8 +103,9 @@ def test_masks_are_found_where_colmap_has_them(tmp_path: Path) -> None:
 
 def test_dark_gray_is_not_black(tmp_path: Path) -> None:
     (features,) = SiftExtractor().extract([textured(0)])
-    assert unmasked(features, None) is features
-    assert len(unmasked(features, save_mask(tmp_path / "m.png", left=320, black=1))) == len(features)
+    camera = parse_camera("camera", CAMERA)
+    assert usable(features, None, camera) is features
+    assert len(usable(features, save_mask(tmp_path / "m.png", left=320, black=1), camera)) == len(features)
 
 
 def test_masks_are_no_photographs(photos: Path) -> None:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from toolkit.geometry import Floats, unit
 
 CAMERA_TYPES = ("camera", "depth")  # sensor types with intrinsics; only `camera` takes photographs
+WIDE = ("FISHEYE", "FOV", "EUCM")  # ends of the names of models for fields of view of 180 degrees and more
 _LARGEST = 2**31 - 1  # largest image side, pixels; COLMAP cannot hold larger numbers
 
 
@@ -23,7 +24,9 @@ def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
     if sensor_type not in CAMERA_TYPES:
         raise ValueError(f"found type {sensor_type!r}, expected one with intrinsics: {' or '.join(CAMERA_TYPES)}.")
     model, *values = [value.strip() for value in params.split(",")]
-    models = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
+    models = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID", "EQUIRECTANGULAR"})
+    if model == "EQUIRECTANGULAR":
+        raise ValueError("found camera model 'EQUIRECTANGULAR': cut such images into views by `import panoramas`.")
     if model not in models:
         raise ValueError(f"found camera model {model!r}, expected one of {', '.join(models)}.")
     default = pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1)
@@ -88,6 +91,24 @@ def rays_of(camera: pycolmap.Camera, pixels: NDArray[np.floating]) -> Floats:
     return unit(np.asarray(camera.cam_ray_from_img(np.asarray(pixels, np.float64))))
 
 
+def invertible(camera: pycolmap.Camera, pixels: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Tell which pixels (N, 2) have a viewing ray.
+
+    Fisheye models of COLMAP give wrong rays, without a word, for pixels 90 degrees or more from the optical axis.
+    """
+    if not camera.model.name.endswith(WIDE) or not len(pixels):
+        return np.ones(len(pixels), bool)
+    xy = np.asarray(pixels, np.float64)
+    again = np.asarray(camera.img_from_cam(np.asarray(camera.cam_ray_from_img(xy)))).reshape(-1, 2)
+    return np.asarray(np.abs(again - xy).max(axis=1) < 0.5)  # also False for NaN
+
+
+def sees_all(camera: pycolmap.Camera) -> bool:
+    """Tell whether all pixels of an image have a viewing ray."""
+    corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * [camera.width, camera.height]
+    return bool(invertible(camera, corners).all())
+
+
 def projection_jacobian(in_cams: Floats, focals_px: Floats) -> Floats:
     """Return the Jacobians (n, 2, 3), pixels per meter, of the projections (f x/z, f y/z) of points (n, 3).
 
@@ -104,7 +125,9 @@ def projection_jacobian(in_cams: Floats, focals_px: Floats) -> Floats:
 def view_bounds(camera: pycolmap.Camera) -> Floats:
     """Return x_min, x_max, y_min, y_max of the field of view at depth 1."""
     w, h = camera.width, camera.height
-    rays = rays_of(camera, np.array([[0, h / 2], [w, h / 2], [w / 2, 0], [w / 2, h]]))
+    edges = np.array([[0, h / 2], [w, h / 2], [w / 2, 0], [w / 2, h]])
+    ends = np.array([[-1.0, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0]])
+    rays = np.where(invertible(camera, edges)[:, None], rays_of(camera, edges), ends)
     rays = rays / np.maximum(rays[:, 2:], 0.2)  # fields of view wider than 157 degrees are clipped
     return np.array([rays[0, 0], rays[1, 0], rays[2, 1], rays[3, 1]])
 

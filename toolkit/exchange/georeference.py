@@ -1,4 +1,4 @@
-"""Make a reconstruction level and metric: from GPS, from known positions, or from one measured distance."""
+"""Make a reconstruction level and metric by GPS, known positions or a distance, and find its poses on the Earth."""
 
 import csv
 from collections.abc import Mapping
@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from toolkit.capture import Session
+from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import CaptureError, ManifestError
-from toolkit.files import own_name
+from toolkit.files import own_name, read_json
 from toolkit.geometry import Floats, make_pose
 
 MAX_ERRORS_M = (0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
@@ -22,7 +24,11 @@ MAX_SCALE_DEVIATION = 0.1  # largest relative standard deviation of a scale that
 MAX_TILT_DEG = 2.0  # largest standard deviation of the vertical by known positions; else the cameras tell it
 NEAR_PX = 0.02  # largest distance of a point's observations from the given pixel, in multiples of the image's width
 MAX_DEPTHS = 1.15  # largest ratio of the depths of the points there
+RECORD = "proc/reconstruction.json"
+GEO_COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "heading_deg", "pitch_deg")
 _EARTH_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84
+_SQUARE = _FLATTENING * (2 - _FLATTENING)  # squared eccentricity
+_LEAST_HORIZONTAL = 1e-3  # smallest horizontal part of an optical axis that has a heading
 GPS = "GPS in EXIF"
 
 
@@ -88,7 +94,7 @@ def place(
     by = how if level else "the cameras"
     record |= {"meters": how, "residual_m": residual_m, "scale deviation": scale_deviation, "up": f"by {by}"}
     if origin is not None:
-        record["origin"] = dict(zip(("latitude_deg", "longitude_deg", "altitude_m"), origin.tolist(), strict=True))
+        record["origin"] = dict(zip(GEO_COLUMNS[:3], origin.tolist(), strict=True))
         record["axes"] = "x east, y north, z up"
     return Placing("m", record, [f"meters: from {how}, {facts}; up: by {by}"])
 
@@ -209,18 +215,80 @@ def east_north_up(positions: Floats, origin: Floats) -> Floats:
     WGS 84 to Earth-centered, Earth-fixed coordinates and to local ones, B. Hofmann-Wellenhof et al., "GNSS", 2008.
     """
 
-    def fixed(geo: Floats) -> Floats:
-        latitude, longitude, altitude = np.radians(geo[..., 0]), np.radians(geo[..., 1]), geo[..., 2]
-        square = _FLATTENING * (2 - _FLATTENING)
-        normal = _EARTH_M / np.sqrt(1 - square * np.sin(latitude) ** 2)
-        flat = (normal + altitude) * np.cos(latitude)
-        z = (normal * (1 - square) + altitude) * np.sin(latitude)
-        return np.stack([flat * np.cos(longitude), flat * np.sin(longitude), z], axis=-1)
+    return (_earth_fixed(positions) - _earth_fixed(origin)) @ _local_axes(origin).T
 
+
+def geographic(positions: Floats, origin: Floats) -> Floats:
+    """Return the inverse of `east_north_up`: latitudes, longitudes and altitudes (N, 3) of positions (N, 3).
+
+    B. R. Bowring, "Transformation from spatial to geographical coordinates", Survey Review, 1976, iterated.
+    """
+    x, y, z = (positions @ _local_axes(origin) + _earth_fixed(origin)).T
+    polar_m, from_axis = _EARTH_M * (1 - _FLATTENING), np.hypot(x, y)
+    tangent = z / ((1 - _FLATTENING) * from_axis)  # of the reduced latitude
+    for _ in range(3):
+        reduced = np.arctan(tangent)
+        above = z + _SQUARE / (1 - _SQUARE) * polar_m * np.sin(reduced) ** 3
+        latitude = np.arctan2(above, from_axis - _SQUARE * _EARTH_M * np.cos(reduced) ** 3)
+        tangent = (1 - _FLATTENING) * np.tan(latitude)
+    normal = _EARTH_M / np.sqrt(1 - _SQUARE * np.sin(latitude) ** 2)
+    altitude = from_axis * np.cos(latitude) + z * np.sin(latitude) - _EARTH_M**2 / normal
+    return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), altitude], axis=-1)
+
+
+def geographic_poses(world_from_cams: Floats, origin: Floats) -> Floats:
+    """Return `GEO_COLUMNS` (N, 5) of camera poses (N, 4, 4) in the local frame at `origin`; NaN for poses of NaN.
+
+    The heading is that of the optical axis, clockwise from true north at the camera, 0 to 360 degrees; NaN if it is
+    vertical. The pitch is its angle above the horizon.
+    """
+    geo = geographic(world_from_cams[:, :3, 3], origin)
+    axes = np.stack([_local_axes(one) for one in geo]).reshape(-1, 3, 3)
+    # From the frame at the origin to that at each camera, where north has another direction.
+    east, north, up = np.einsum("nij,kj,nk->in", axes, _local_axes(origin), world_from_cams[:, :3, 2])
+    heading = np.degrees(np.arctan2(east, north)) % 360
+    heading[np.hypot(east, north) < _LEAST_HORIZONTAL] = np.nan
+    return np.column_stack([geo, heading, np.degrees(np.arcsin(np.clip(up, -1, 1)))])
+
+
+def origin_of(session: Session) -> Floats:
+    """Return latitude, longitude (degrees) and altitude (meters) of the origin of a map.
+
+    Raises:
+        CaptureError: the map has no origin on the Earth, or a malformed one.
+    """
+    for name in (RECORD, IMPORT_RECORD):
+        origin = read_json(session.path / name).get("origin")
+        if origin is not None:
+            try:
+                values = np.array([float(origin[key]) for key in GEO_COLUMNS[:3]])
+            except (KeyError, TypeError, ValueError):
+                values = np.full(3, np.nan)
+            if not np.isfinite(values).all() or abs(values[0]) > 90:
+                expected = f"expected the numbers {', '.join(GEO_COLUMNS[:3])}"
+                raise CaptureError(f"{session.path / name}: origin: found {origin!r}, {expected}.")
+            return values
+    raise CaptureError(
+        f"{session.path}: the map has no origin on the Earth, so its poses have no latitude and longitude. Reconstruct "
+        f"it from photographs with GPS. Or, if its axes are east, north and up, in meters, write the key `origin` with "
+        f"{', '.join(GEO_COLUMNS[:3])} into {IMPORT_RECORD}."
+    )
+
+
+def _earth_fixed(geo: Floats) -> Floats:
+    """Return Earth-centered, Earth-fixed coordinates (..., 3), meters."""
+    latitude, longitude, altitude = np.radians(geo[..., 0]), np.radians(geo[..., 1]), geo[..., 2]
+    normal = _EARTH_M / np.sqrt(1 - _SQUARE * np.sin(latitude) ** 2)
+    flat = (normal + altitude) * np.cos(latitude)
+    z = (normal * (1 - _SQUARE) + altitude) * np.sin(latitude)
+    return np.stack([flat * np.cos(longitude), flat * np.sin(longitude), z], axis=-1)
+
+
+def _local_axes(origin: Floats) -> Floats:
+    """Return the directions east, north and up at a place, the rows of (3, 3), in Earth-fixed coordinates."""
     lat, lon = np.radians(origin[:2])
-    axes = np.array([
+    return np.array([
         [-np.sin(lon), np.cos(lon), 0.0],
         [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
         [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
     ])  # fmt: skip
-    return (fixed(positions) - fixed(origin)) @ axes.T

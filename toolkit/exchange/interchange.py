@@ -402,6 +402,17 @@ def _bad(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[rows["problem"] != ""] if "qw" in rows else rows[:0]
 
 
+def read_poses(
+    table: Path, poses_are: str, axes: str, unit_m: float
+) -> tuple[list[str], dict[str, Floats]]:  # fmt: skip
+    """Return the images of a table, and their world_from_cam (4, 4) in meters; see `import_images`."""
+    if poses_are not in POSE_DIRECTIONS:
+        raise ManifestError(f"poses_are: unknown {poses_are!r}. {nearest(poses_are, POSE_DIRECTIONS)}")
+    require_convention(axes, unit_m)
+    rows = _read_table(table)
+    return list(rows["image"]), _poses_of(rows, poses_are, axes, unit_m)
+
+
 def _read_table(path: Path) -> pd.DataFrame:
     """Read the table of a folder of images, all values as text, with the additional column `line`.
 

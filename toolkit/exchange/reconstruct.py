@@ -35,7 +35,7 @@ from toolkit.exchange.drafts import (
     start,
     write_drafts,
 )
-from toolkit.exchange.georeference import place, read_positions
+from toolkit.exchange.georeference import RECORD, place, read_positions
 from toolkit.exchange.interchange import once
 from toolkit.exchange.photographs import OTHER_SUFFIXES, VIDEO_SUFFIXES, Photograph, gather, initial_cameras
 from toolkit.features.features import KINDS, LocalFeatures
@@ -59,7 +59,6 @@ from toolkit.threads import one_thread
 log = logging.getLogger(__name__)
 
 FOLDER = "reconstruction"
-RECORD = "proc/reconstruction.json"
 ALL_PAIRS = 60  # up to this number of photographs, all pairs are matched
 NEIGHBORS, SIMILAR = 10, 20  # else each photograph with so many next ones in its folder, and so many that look similar
 MIN_INLIERS = 15  # of a pair that counts

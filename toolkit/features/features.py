@@ -7,8 +7,10 @@ from pkgutil import resolve_name
 from typing import Any, Protocol
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
+from toolkit.capture.cameras import invertible, sees_all
 from toolkit.capture.images import read_image
 from toolkit.capture.upright import turn_image, turn_points
 from toolkit.errors import ImageError, ManifestError
@@ -153,12 +155,14 @@ def extract_turned(
     return [features.turned(-turn) if turn else features for features, turn in zip(upright, turns, strict=True)]
 
 
-def unmasked(features: LocalFeatures, mask: Path | None) -> LocalFeatures:
-    """Return the features outside of the black pixels of an image's mask, as COLMAP does; None: all features.
+def usable(features: LocalFeatures, mask: Path | None, camera: pycolmap.Camera) -> LocalFeatures:
+    """Return the features outside of the black pixels of an image's mask, as COLMAP does, that have a viewing ray.
 
     Raises:
         ImageError: the mask cannot be read, has another size than the image as stored, or is black everywhere.
     """
+    if not sees_all(camera):
+        features = features.take(np.flatnonzero(invertible(camera, features.keypoints)))
     if mask is None:
         return features
     pixels, (width, height) = read_image(mask, gray=True), features.image_size

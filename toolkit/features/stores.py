@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Session
+from toolkit.capture.cameras import camera_text, sees_all
 from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.errors import ArtifactError, ImageError
-from toolkit.features.features import KINDS, Extractor, LocalFeatures, extract_turned, unmasked
+from toolkit.features.features import KINDS, Extractor, LocalFeatures, extract_turned, usable
 from toolkit.features.matching import Matcher, PairMatches
 from toolkit.features.sift import SiftExtractor
 from toolkit.files import files_fingerprint, fingerprint, link_folder
@@ -221,8 +222,9 @@ class OnDemandFeatures:
 def _made_from(session: Session, row: int, turns: int) -> str:
     """Return a fingerprint of an image: its files' names, sizes and times of change, camera size, and turns."""
     camera = session.camera(session.images["sensor_id"].iloc[row])
+    cut = [] if sees_all(camera) else [f"without pixels that have no ray, {camera_text(camera)}"]
     turned, files = [turns] if turns else [], [session.image_path(row), *session.mask_paths([row])]
-    return fingerprint([files_fingerprint(files), camera.width, camera.height, *turned])
+    return fingerprint([files_fingerprint(files), camera.width, camera.height, *turned, *cut])
 
 
 def _extract(
@@ -242,16 +244,16 @@ def _extract(
             return f"Image of {image.shape[1]} x {image.shape[0]} pixels, but {said}"
         return image
 
-    def without_masked(row: int, features: LocalFeatures) -> LocalFeatures | str:
+    def only_usable(row: int, features: LocalFeatures) -> LocalFeatures | str:
         try:
-            return unmasked(features, session.mask_path(row))
+            return usable(features, session.mask_path(row), session.camera(sensors[row]))
         except ImageError as error:
             return str(error)
 
     def read_and_extract(item: tuple[int, int]) -> LocalFeatures | str:
         row, turns = item
         image = read(row)
-        return image if isinstance(image, str) else without_masked(row, extract_turned(extractor, [image], [turns])[0])
+        return image if isinstance(image, str) else only_usable(row, extract_turned(extractor, [image], [turns])[0])
 
     if extractor.threaded:
         yield from prefetch(read_and_extract, images, workers)
@@ -262,7 +264,7 @@ def _extract(
         readable = [(image, turns) for image, (_, turns) in batch if not isinstance(image, str)]
         features = iter(extract_turned(extractor, *zip(*readable, strict=True)) if readable else [])
         for image, (row, _) in batch:
-            yield image if isinstance(image, str) else without_masked(row, next(features))
+            yield image if isinstance(image, str) else only_usable(row, next(features))
 
 
 def matches_path(out: str | Path, session0: str, session1: str, made_by: Mapping[str, Any]) -> Path:

@@ -14,7 +14,7 @@ from toolkit import geometry
 from toolkit.capture.cameras import camera_text
 from toolkit.capture.images import pixels_of, stored_size, thumbnails
 from toolkit.errors import CameraError
-from toolkit.features.features import KINDS, LocalFeatures, extract_turned, unmasked
+from toolkit.features.features import KINDS, LocalFeatures, extract_turned, usable
 from toolkit.features.matching import AnyMethod, PairMatches
 from toolkit.geometry import Floats, Ints
 from toolkit.pose.result import QueryResult, Status
@@ -65,10 +65,10 @@ class View:
         return self._decoded[color, least_side]
 
     def extract(self, method: AnyMethod) -> LocalFeatures:
-        """Return the local features of one kind; see `read` and `unmasked` for the errors."""
+        """Return the local features of one kind; see `read` and `usable` for the errors."""
         turns = self.turns if KINDS[method.name].upright else 0
         (features,) = extract_turned(method.extractor, [self.read(method.extractor.color)], [turns])
-        return unmasked(features, self.mask)
+        return usable(features, self.mask, self.camera)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from toolkit.embedders.index import VectorIndex, load_index
 from toolkit.embedders.search import search
 from toolkit.embedders.stored import embedder_fingerprint
 from toolkit.errors import ArtifactError
-from toolkit.features.features import KINDS, unmasked
+from toolkit.features.features import KINDS, usable
 from toolkit.features.matching import LocalMethod, create_local_methods
 from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import FeatureStore
@@ -65,7 +65,8 @@ class ReferenceSearch:
             at = settings.index(sift.settings)
             return [features[at] for features in query.features if not isinstance(features, str)]
         extracted = sift.extract([view.read(color=False) for view in query.views])
-        return [unmasked(features, view.mask) for features, view in zip(extracted, query.views, strict=True)]
+        views = zip(extracted, query.views, strict=True)
+        return [usable(features, view.mask, view.camera) for features, view in views]
 
     def find(
         self, query: Query, k: int | None = None, allowed: Sequence[NDArray[np.bool_] | None] = ()

@@ -1,0 +1,139 @@
+"""Poses on the Earth: headings with known answers, tables of a run, position and direction in copies of pictures."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import PIL.Image
+import pytest
+from typer.testing import CliRunner
+
+from toolkit.__main__ import app
+from toolkit.capture import Capture
+from toolkit.errors import CaptureError, ManifestError
+from toolkit.exchange.geo import export_exif, export_geo, geo_table
+from toolkit.exchange.georeference import GEO_COLUMNS, east_north_up, geographic, geographic_poses, origin_of
+from toolkit.exchange.photographs import gather
+from toolkit.geometry import Floats, make_pose
+from toolkit.scene import Run
+
+ORIGIN = np.array([-33.8568, 151.2153, 5.0])
+
+
+def looking(direction: list[float], position: Floats | None = None) -> Floats:
+    """world_from_cam (1, 4, 4) of a camera whose optical axis has this direction: east, north, up."""
+    z = np.array(direction) / np.linalg.norm(direction)
+    x = np.cross(z, [0, 0, 1] if abs(z[2]) < 0.9 else [0, 1, 0])
+    x /= np.linalg.norm(x)
+    return make_pose(np.stack([x, np.cross(z, x), z], axis=1), np.zeros(3) if position is None else position)[None]
+
+
+@pytest.mark.parametrize("origin", [ORIGIN, np.array([47.4, 8.5, 400.0]), np.array([0.0, -179.99, 0.0])])
+def test_geographic_undoes_the_local_frame(origin: Floats) -> None:
+    local = np.random.default_rng(0).normal(size=(50, 3)) * [20_000, 20_000, 500]
+    assert np.allclose(east_north_up(geographic(local, origin), origin), local, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("direction", "heading", "pitch"),
+    [([0, 1, 0], 0, 0), ([1, 0, 0], 90, 0), ([0, -1, 0], 180, 0), ([-1, 0, 0], 270, 0), ([1, 1, np.sqrt(2)], 45, 45),
+     ([-1, 1, 0], 315, 0)],
+)  # fmt: skip
+def test_heading_is_clockwise_from_north(direction: list[float], heading: float, pitch: float) -> None:
+    assert geographic_poses(looking(direction), ORIGIN)[0] == pytest.approx([*ORIGIN, heading, pitch], abs=1e-6)
+
+
+def test_a_vertical_camera_has_no_heading_and_a_missing_pose_nothing() -> None:
+    down, nothing = geographic_poses(np.concatenate([looking([0, 0, -1]), np.full((1, 4, 4), np.nan)]), ORIGIN)
+    assert np.isnan(down[3])
+    assert down[4] == pytest.approx(-90)
+    assert np.isnan(nothing).all()
+
+
+def test_north_is_that_at_the_camera() -> None:
+    # 100 km east at 45 degrees are 1.268 degrees of longitude; meridians converge by their sine of the latitude.
+    pose = looking([0, 1, 0], np.array([100_000.0, 0, 0]))
+    heading = geographic_poses(pose, np.array([45.0, 7.0, 0.0]))[0, 3]
+    assert heading == pytest.approx(1.268 * np.sin(np.pi / 4), abs=0.01)
+
+
+@pytest.fixture
+def placed(small_capture: Path, tmp_path: Path) -> Path:
+    """The small capture, whose map has an origin."""
+    capture = tmp_path / small_capture.name
+    shutil.copytree(small_capture, capture)
+    record = capture / "sessions/ios_map/proc/import.json"
+    origin = dict(zip(GEO_COLUMNS, ORIGIN.tolist(), strict=False))
+    record.write_text(json.dumps({"unit": "m", "origin": origin}))
+    return capture
+
+
+def test_tables_have_a_row_for_every_image(small_run: Path, placed: Path, tmp_path: Path) -> None:
+    table = geo_table(small_run, placed)
+    assert set(table["map_device"]) == {"ios"}
+    run = Run.open(small_run)
+    images = run.queries[run.queries["map_device"] == "ios"]["image"]
+    assert len(table) == sum(len(str(names).split(";")) for names in images)
+    known = table[table["latitude_deg"].notna()]
+    row = known.iloc[0]
+    result = run.result(row["image"], "ios")
+    session = Capture.open(placed)[f"{row['query_device']}_query"]
+    world_from_cam = result.world_from_rig @ session.rig_from_cam([session.row_of_name[row["image"]]])[0]
+    east, north, _ = world_from_cam[:3, 3]
+    assert row["latitude_deg"] - ORIGIN[0] == pytest.approx(north / 110_922, rel=1e-3)  # meters per degree there
+    assert row["longitude_deg"] - ORIGIN[1] == pytest.approx(east / 92_556, rel=1e-3)
+    axis = world_from_cam[:3, 2]
+    assert row["heading_deg"] == pytest.approx(np.degrees(np.arctan2(axis[0], axis[1])) % 360, abs=1e-3)
+    count = export_geo(small_run, tmp_path / "q.csv", placed)
+    assert count == len(known)
+    assert pd.read_csv(tmp_path / "q.csv")["heading_deg"].notna().sum() == count
+    assert export_geo(small_run, tmp_path / "q.geojson", placed) == count
+    features = json.loads((tmp_path / "q.geojson").read_text())["features"]
+    assert len(features) == len(table)
+    point = next(feature["geometry"] for feature in features if feature["geometry"])
+    assert point["coordinates"] == pytest.approx([row["longitude_deg"], row["latitude_deg"], row["altitude_m"]])
+
+
+def test_copies_have_position_direction_and_the_same_pixels(small_run: Path, placed: Path, tmp_path: Path) -> None:
+    sessions = placed / "sessions"
+    (first, *_) = sorted((sessions / "ios_query/raw_data").rglob("*.jpg"))
+    exif = PIL.Image.Exif()
+    exif[0x010F], exif[0x8825] = "Maker", {1: "N", 2: (1.0, 2.0, 3.0), 17: 5.0, 29: "2026:01:02"}
+    with PIL.Image.open(first) as image:
+        image.save(first, quality=97, exif=exif)
+    arguments = ["export", "exif", small_run, tmp_path / "out", "--capture", placed]
+    result = CliRunner().invoke(app, list(map(str, arguments)))
+    assert result.exit_code == 0, result.output
+    table = geo_table(small_run, placed).query("status == 'ok'").drop_duplicates("image").set_index("image")
+    copies = {path.relative_to(tmp_path / "out").as_posix(): path for path in (tmp_path / "out").rglob("*.jpg")}
+    assert set(copies) == set(table.index)
+    for name, path in copies.items():
+        row = table.loc[name]
+        (photograph,), _ = gather([path], tmp_path / "PLACE/reconstruction/images")
+        assert photograph.geo == pytest.approx(row[list(GEO_COLUMNS[:3])].tolist(), abs=1e-3)
+        assert photograph.geo[:2] == pytest.approx(row[list(GEO_COLUMNS[:2])].tolist(), abs=1e-8)
+        with PIL.Image.open(path) as image:
+            tags = image.getexif().get_ifd(0x8825)
+        assert float(tags[17]) == pytest.approx(row["heading_deg"] % 360, abs=0.006)
+        assert (tags[1], tags[3], tags[16]) == ("S", "E", "T")
+        assert np.array_equal(cv2.imread(str(path)), cv2.imread(str(sessions / name)))
+    with PIL.Image.open(tmp_path / "out" / first.relative_to(sessions)) as image:
+        assert image.getexif()[0x010F] == "Maker"
+        assert image.getexif().get_ifd(0x8825)[29] == "2026:01:02"
+    with pytest.raises(ManifestError):
+        export_exif(small_run, tmp_path / "out", placed)
+
+
+def test_what_is_refused(small_run: Path, placed: Path, tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match="no origin"):
+        geo_table(small_run)
+    with pytest.raises(ManifestError, match="geojson"):
+        export_geo(small_run, tmp_path / "q.kml", placed)
+    record = placed / "sessions/ios_map/proc/import.json"
+    for origin in ([1, 2, 3], {"latitude_deg": 99, "longitude_deg": 1, "altitude_m": 1}, {"latitude_deg": 1}):
+        record.write_text(json.dumps({"origin": origin}))
+        with pytest.raises(CaptureError, match=r"import\.json: origin"):
+            origin_of(Capture.open(placed)["ios_map"])
