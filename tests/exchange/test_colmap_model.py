@@ -11,8 +11,9 @@ import pycolmap
 import pytest
 
 from toolkit.capture import Capture
-from toolkit.errors import CaptureError
+from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.colmap_model import read_model
+from toolkit.exchange.georeference import geographic
 from toolkit.exchange.interchange import import_colmap
 from toolkit.geometry import Floats, invert, make_pose, quaternion_to_rotation
 
@@ -269,3 +270,46 @@ def test_the_folder_of_models(tmp_path: Path) -> None:
         read_model(tmp_path)
     with pytest.raises(CaptureError, match=r"expected a COLMAP model"):
         read_model(Path(__file__).parent)
+
+
+@pytest.mark.parametrize("by", ["positions", "gps"])
+def test_a_model_is_aligned_to_known_places(by: str, tmp_path: Path) -> None:
+    """A model in another world and unit, with a rig, comes out in the world of its camera centers."""
+    rng = np.random.default_rng(5)
+    count, origin = 12, np.array([47.0, 8.0, 400.0])
+    truth = [make_pose(quaternion_to_rotation(rng.normal(size=4)), rng.uniform(-60, 60, 3)) for _ in range(count)]
+    turn, scale, shift = quaternion_to_rotation([0.3, 0.5, -0.7, 0.2]), 0.05, np.array([3.0, -1.0, 2.0])
+    given = [make_pose(turn @ p[:3, :3], scale * turn @ p[:3, 3] + shift) for p in truth]  # world_from_cam
+    lines = []
+    for k, pose_given in enumerate(given, start=1):
+        moved = pycolmap.Rigid3d(invert(pose_given)[:3])
+        q = moved.rotation.quat
+        lines.append(" ".join(f"{v:.17g}" for v in (k, q[3], *q[:3], *moved.translation)) + f" 1 {k}.jpg\n\n")
+        exif, degrees = PIL.Image.Exif(), geographic(truth[k - 1][None, :3, 3], origin)[0]
+        gps = {1: "N", 2: (degrees[0], 0.0, 0.0), 3: "E", 4: (degrees[1], 0.0, 0.0), 6: degrees[2]}
+        exif.get_ifd(0x8825).update(gps if by == "gps" else {})
+        (tmp_path / "photos").mkdir(exist_ok=True)
+        PIL.Image.new("RGB", (64, 48)).save(tmp_path / "photos" / f"{k}.jpg", exif=exif)
+    folder = write(tmp_path / "model", "".join(lines))
+    rows = [f"{k}.jpg," + ",".join(f"{v:.9f}" for v in p[:3, 3]) for k, p in enumerate(truth, start=1)]
+    (tmp_path / "t.csv").write_text("\n".join(["image,x,y,z", *rows]))
+    options = {"gps": True} if by == "gps" else {"positions": tmp_path / "t.csv"}
+    report = import_colmap(folder, tmp_path / "photos", tmp_path / "PLACE", **options)
+    capture = Capture.open(tmp_path / "PLACE")
+    assert capture.unit == "m"
+    assert any(note.startswith("meters: from") for note in report.notes)
+    found = capture["ios_map"].world_from_cam()
+    names = [int(Path(path).stem) - 1 for path in capture["ios_map"].images["path"]]
+    expected = np.stack([truth[k] for k in names])
+    if by == "gps":  # in the frame at the median position
+        assert "origin" in report.session.joinpath("proc/import.json").read_text()
+        expected[:, :3, 3] += (found - expected)[:, :3, 3].mean(axis=0)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=0.02 if by == "gps" else 1e-5)
+    with pytest.raises(ManifestError, match="unit"):
+        import_colmap(folder, tmp_path / "photos", tmp_path / "OTHER", unit_m=1.0, **options)
+
+
+def test_a_model_without_gps_says_so(tmp_path: Path, photos: Path) -> None:
+    report = import_colmap(rig_model(tmp_path / "model"), photos, tmp_path / "PLACE", device="hl", gps=True)
+    assert any("no photograph has GPS" in note for note in report.notes)
+    assert Capture.open(tmp_path / "PLACE").unit is None

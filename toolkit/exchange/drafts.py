@@ -124,6 +124,7 @@ class Draft:
     given_times: int = 0  # images whose time is not from EXIF
     masks: Path | None = None  # folder of masks as COLMAP names them; None: see `images.find_mask`
     mask_files: dict[str, Path] = field(default_factory=dict)  # those that are not in `masks` under their names
+    record: dict[str, Any] = field(default_factory=dict)  # further content of `proc/import.json`
     match_names: bool = False  # take files whose names differ only in case, extension or separators
     sensors: dict[str, str] = field(default_factory=dict)  # id by `camera_text`, for images that are not in a rig
 
@@ -180,6 +181,7 @@ class Draft:
         queries.poses = {frame: pose for frame, pose in self.poses.items() if frame in held}
         self.poses = {frame: pose for frame, pose in self.poses.items() if frame not in held}
         queries.rigs, queries.unit, queries.sources = self.rigs, self.unit, self.sources
+        queries.record, queries.match_names = self.record, self.match_names
         queries.mask_files, queries.match_names = self.mask_files, self.match_names
         return queries
 
@@ -295,7 +297,7 @@ class Draft:
                     target.symlink_to(os.path.abspath(source))  # noqa: PTH100 - must not resolve links in the source
             self._write_tables(session, times)
             table.to_csv(session / "proc" / "import.csv", index=False)
-            (session / IMPORT_RECORD).write_text(json.dumps({"unit": self.unit}) + "\n", encoding="utf-8")
+            (session / IMPORT_RECORD).write_text(json.dumps({"unit": self.unit} | self.record) + "\n", encoding="utf-8")
             if self.placing == "link":
                 note_linked_here(session)
         return ImportReport(self.session, table, self.notes)
