@@ -391,6 +391,19 @@ def test_names_that_differ_a_little_from_their_files(listed: str, stored: str, f
     np.testing.assert_allclose(poses_of(Capture.open(tmp_path / "PLACE")["ios_map"])[stored], pose(3), atol=1e-9)
 
 
+def test_names_that_are_not_utf8(tmp_path: Path) -> None:
+    save(tmp_path / "photos" / "caf\u00e9.jpg")
+    (tmp_path / "photos" / "m\udcfcller.jpg").write_bytes((tmp_path / "photos" / "caf\u00e9.jpg").read_bytes())
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "cameras.txt").write_text("1 PINHOLE 64 48 50 51 32 24\n")
+    lines = "1 1 0 0 0 1 2 3 1 caf\u00e9.jpg\n\n2 1 0 0 0 1 2 3 1 m\u00fcller.jpg\n\n"
+    (tmp_path / "model" / "images.txt").write_text(lines, encoding="cp1252")
+    report = import_colmap(tmp_path / "model", tmp_path / "photos", tmp_path / "PLACE")
+    status = report.images.set_index("image")["status"]
+    assert status["caf\u00e9.jpg"] == "imported"
+    assert "not UTF-8" in status.drop("caf\u00e9.jpg").iloc[0]
+
+
 def test_names_that_fit_two_files_are_not_guessed(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     for name in ("img.jpg", "IMG.png", "good.jpg"):

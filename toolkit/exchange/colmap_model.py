@@ -27,6 +27,8 @@ NORM_TOLERANCE = 0.01
 _CAMERA = 0
 """Type of the sensors that are cameras, in .bin files."""
 _SUFFIXES = (".bin", ".txt")
+_LATER_CHANGED = int(pycolmap.CameraModelId.RAD_TAN_THIN_PRISM_FISHEYE)
+"""Model that had 14 parameters in earlier versions of COLMAP."""
 
 
 @dataclass(frozen=True)
@@ -353,7 +355,12 @@ def _binary_cameras(path: Path, model: ColmapModel) -> None:
             found = f"camera {camera_id} of the unknown model number {kind}"
             raise CaptureError(f"{path}: found {found}, expected one of {', '.join(known.values())}.")
         count = len(pycolmap.Camera.create_from_model_name(0, known[kind], 1.0, 1, 1).params)
-        camera = _camera(known[kind], size, file.read(f"{count}d"))
+        try:
+            params = file.read(f"{count}d")
+        except CaptureError as error:
+            older = f"{error} Or an older COLMAP wrote other parameters of {known[kind]}: export the model as .txt."
+            raise CaptureError(older if kind == _LATER_CHANGED else str(error)) from None
+        camera = _camera(known[kind], size, params)
         model.cameras[_new(path, "camera", camera_id, model.cameras)] = camera
 
 

@@ -13,7 +13,6 @@ import unicodedata
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -243,7 +242,7 @@ class Draft:
     def _match_names(self) -> str:
         """Give images whose file is missing the file that their name probably means. Return a note, or an empty text.
 
-        Equal names in another Unicode form (macOS decomposes letters) are taken; those that differ in case, extension
+        Equal names in another encoding (macOS decomposes letters) are taken; those that differ in case, extension
         or separators with `match_names`, else only noted.
         """
         missing = [image for image in self.images if not is_file(self.source(image.name))]
@@ -253,7 +252,7 @@ class Draft:
         files = [name for name in walk_files(self.folder)[0] if name not in wanted]
         notes = []
         for key_of, taken, differ in (
-            (partial(unicodedata.normalize, "NFC"), True, "the Unicode form of letters"),
+            (_composed, True, "the encoding of letters"),
             (_loose, self.match_names, "case, extension or separators"),
         ):
             keys = Counter(key_of(image.name) for image in missing)
@@ -331,6 +330,8 @@ class Draft:
             return "the capture format cannot hold the comma in its name"
         if image.name.startswith("/") or ".." in name.parts:
             return NOT_INSIDE
+        if printable(image.name) != image.name:
+            return "its name is not UTF-8: rename it"
         if is_bad_name(image.name):
             return f"the capture format cannot hold this name, expected {EXPECTED_NAME}"
         if image.name.lower().endswith(HEIC_SUFFIXES) and not heic_is_read():
@@ -490,8 +491,15 @@ def printable(name: str) -> str:
     return name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 
 
+def _composed(name: str) -> str:
+    """Return a name with composed letters (NFC); one that is not UTF-8 is read as Windows writes it."""
+    if printable(name) != name:
+        name = name.encode("utf-8", "surrogateescape").decode("cp1252", "replace")
+    return unicodedata.normalize("NFC", name)
+
+
 def _loose(name: str) -> str:
-    name = unicodedata.normalize("NFC", name).replace("\\", "/").casefold()
+    name = _composed(name).replace("\\", "/").casefold()
     stem, dot, suffix = name.rpartition(".")
     return stem if f"{dot}{suffix}" in (*IMAGE_SUFFIXES, *PHOTOGRAPHS) else name
 
