@@ -576,6 +576,16 @@ def test_time_zones_that_change_are_applied(tmp_path: Path) -> None:
     assert report.images.set_index("image")["timestamp"]["a.jpg"] == times["a.jpg"] + 2 * 3600 * 10**6, "the clock's"
 
 
+def test_a_crop_keeps_the_focal_length_of_the_whole_image(tmp_path: Path) -> None:
+    tags = {0xA405: 28, 0xA002: 128, 0xA003: 96}
+    whole = 28 * np.hypot(128, 96) / np.hypot(36, 24)
+    sizes = {"crop": ((64, 30), whole), "turned": ((96, 128), whole), "small": ((64, 48), whole / 2)}
+    for name, (size, expected) in sizes.items():
+        camera, said = exif_camera(save(tmp_path / f"{name}.jpg", size, tags))
+        assert camera.params[0] == pytest.approx(expected)
+        assert ("cropped" in said) == (name == "crop")
+
+
 @pytest.mark.parametrize("orientation", [0, 9, 65535])
 def test_an_orientation_that_means_nothing_is_ignored(orientation: int, tmp_path: Path) -> None:
     save(tmp_path / "photos" / "a.jpg", tags={0x0112: orientation})
