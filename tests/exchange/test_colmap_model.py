@@ -57,7 +57,7 @@ def assert_read(folder: Path, atol: float = 1e-9) -> None:
     images = read_model(folder).images.values()
     assert [image.name for image in images] == NAMES
     for number, image in enumerate(images):
-        np.testing.assert_allclose(image.cam_from_world, pose(number), rtol=0, atol=atol)
+        np.testing.assert_allclose(image.cam_from_world.matrix(), pose(number)[:3], rtol=0, atol=atol)
 
 
 POINTS = "".join(f"{x}.5 7 {x % 3 - 1} " for x in range(5)).strip() + "\n"
@@ -91,16 +91,17 @@ def test_text_is_read_however_it_was_written(change: Callable[[str], str | bytes
 
 def test_exponents_of_three_digits_are_read(tmp_path: Path) -> None:
     line = "1 1.000e+000 0 0 0 -2.5e-002 1e+001 3E+000 1 a.jpg"
-    np.testing.assert_array_equal(read_model(write(tmp_path, line)).images[1].cam_from_world[:3, 3], [-0.025, 10, 3])
+    found = read_model(write(tmp_path, line)).images[1].cam_from_world
+    np.testing.assert_array_equal(found.translation, [-0.025, 10, 3])
 
 
 def test_quaternions_of_few_digits_are_normalized_and_positions_do_not_scale(tmp_path: Path) -> None:
     model = read_model(write(tmp_path, images_txt(digits=3)))
     for number, image in enumerate(model.images.values()):
-        center, expected = invert(image.cam_from_world)[:3, 3], invert(pose(number))[:3, 3]
-        rotation = image.cam_from_world[:3, :3]
+        center, expected = image.cam_from_world.inverse().translation, invert(pose(number))[:3, 3]
+        rotation = image.cam_from_world.rotation.matrix()
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-        assert np.linalg.norm(center) == pytest.approx(np.linalg.norm(image.cam_from_world[:3, 3]), rel=1e-12)
+        assert np.linalg.norm(center) == pytest.approx(np.linalg.norm(image.cam_from_world.translation), rel=1e-12)
         np.testing.assert_allclose(center, expected, atol=1.0)
 
 
@@ -313,3 +314,15 @@ def test_a_model_without_gps_says_so(tmp_path: Path, photos: Path) -> None:
     report = import_colmap(rig_model(tmp_path / "model"), photos, tmp_path / "PLACE", device="hl", gps=True)
     assert any("no photograph has GPS" in note for note in report.notes)
     assert Capture.open(tmp_path / "PLACE").unit is None
+
+
+@pytest.mark.parametrize("form", ["txt", "bin"])
+def test_poses_are_those_of_colmaps_own_reader(form: str, tmp_path: Path) -> None:
+    folder = write(tmp_path / "model", images_txt().replace(" of 3 ", "").replace("IMG (1)", "b"))
+    folder = binary(folder, tmp_path / "bin") if form == "bin" else folder
+    (folder / "points3D.txt").touch()
+    expected = pycolmap.Reconstruction(str(folder)).images
+    found = read_model(folder).images
+    assert found.keys() == set(expected)
+    for number, image in found.items():
+        np.testing.assert_array_equal(image.cam_from_world.matrix(), expected[number].cam_from_world().matrix())

@@ -20,7 +20,7 @@ import pycolmap
 from toolkit.capture.cameras import parse_camera
 from toolkit.capture.tables import FARTHEST_M
 from toolkit.errors import CaptureError
-from toolkit.geometry import Floats, pose_from_qt
+from toolkit.geometry import Floats, make_pose
 
 NORM_TOLERANCE = 0.01
 """Deviation from 1 of the length of a quaternion that counts as rounding."""
@@ -37,8 +37,8 @@ class ModelImage:
 
     name: str
     camera_id: int
-    cam_from_world: Floats | str
-    """(4, 4), or why there is no pose."""
+    cam_from_world: pycolmap.Rigid3d | str
+    """The pose, or why there is none."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class ModelFrame:
     """What the sensors of a rig measured at one instant."""
 
     rig_id: int
-    rig_from_world: Floats | str
-    """(4, 4), or why there is no pose."""
+    rig_from_world: pycolmap.Rigid3d | str
+    """The pose, or why there is none."""
     image_ids: Sequence[int]
 
 
@@ -58,8 +58,8 @@ class ColmapModel:
     cameras: dict[int, pycolmap.Camera | str] = field(default_factory=dict)
     """Each camera, or why it cannot be used."""
     images: dict[int, ModelImage] = field(default_factory=dict)
-    rigs: dict[int, dict[int, Floats | None]] = field(default_factory=dict)
-    """sensor_from_rig (4, 4) by camera, of all rigs with several sensors; None for a camera that is not calibrated."""
+    rigs: dict[int, dict[int, pycolmap.Rigid3d | None]] = field(default_factory=dict)
+    """sensor_from_rig by camera, of all rigs with several sensors; None for a camera that is not calibrated."""
     frames: dict[int, ModelFrame] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     """What a user should know of how the files were read."""
@@ -130,22 +130,29 @@ def _no_model(folder: Path, models: Sequence[Path]) -> CaptureError:
 # What both formats share
 
 
-def _pose(values: Sequence[float]) -> Floats | str:
+def _pose(values: Sequence[float]) -> pycolmap.Rigid3d | str:
     return _poses([values])[0]
 
 
-def _poses(rows: Sequence[Sequence[float]]) -> list[Floats | str]:
-    """Return the pose (4, 4) of each row qw qx qy qz tx ty tz, or why it is none. Quaternions are normalized."""
+def _poses(rows: Sequence[Sequence[float]]) -> list[pycolmap.Rigid3d | str]:
+    """Return the pose of each row qw qx qy qz tx ty tz, or why it is none. Quaternions are normalized."""
     table = np.array(rows, np.float64).reshape(-1, 7)
     finite = np.all(np.abs(table) < FARTHEST_M, axis=1)
     lengths = np.linalg.norm(np.where(finite[:, None], table[:, :4], 0.0), axis=1)
     valid = np.abs(lengths - 1) <= NORM_TOLERANCE
-    poses: list[Floats | str] = [f"its quaternion has the length {length:.4g}, expected 1" for length in lengths]
+    poses: list[pycolmap.Rigid3d | str] = [f"its quaternion has the length {one:.4g}, expected 1" for one in lengths]
     for index in np.flatnonzero(~finite).tolist():
         poses[index] = f"its pose is not finite: {', '.join(f'{value:g}' for value in rows[index])}"
-    for index, pose in zip(np.flatnonzero(valid).tolist(), pose_from_qt(table[valid]), strict=True):
-        poses[index] = pose
+    table[valid, :4] /= np.where(np.abs(lengths - 1) > 1e-12, lengths, 1.0)[valid, None]
+    for index in np.flatnonzero(valid).tolist():
+        poses[index] = pycolmap.Rigid3d(pycolmap.Rotation3d(table[index, [1, 2, 3, 0]]), table[index, 4:])
     return poses
+
+
+def inverse(a_from_b: pycolmap.Rigid3d) -> Floats:
+    """Return b_from_a, (4, 4)."""
+    b_from_a = a_from_b.inverse()
+    return make_pose(b_from_a.rotation.matrix(), b_from_a.translation)
 
 
 def _set_images(model: ColmapModel, rows: Mapping[int, tuple[str, int, Sequence[float]]]) -> None:
@@ -165,7 +172,7 @@ def _camera(
         return f"its camera cannot be used: {where}{error}"
 
 
-def _add_rig(model: ColmapModel, rig_id: int, cameras: dict[int, Floats | None], sensors: int) -> None:
+def _add_rig(model: ColmapModel, rig_id: int, cameras: dict[int, pycolmap.Rigid3d | None], sensors: int) -> None:
     if sensors > 1:
         model.rigs[rig_id] = cameras
 
@@ -277,10 +284,10 @@ def _text_rigs(path: Path, model: ColmapModel) -> None:
         if not line:
             continue
         try:
-            rig_id, count, cameras = int(next(words)), int(next(words)), dict[int, Floats | None]()
+            rig_id, count, cameras = int(next(words)), int(next(words)), dict[int, pycolmap.Rigid3d | None]()
             for sensor in range(count):
                 kind, sensor_id = next(words), int(next(words))
-                pose: Floats | str | None = np.eye(4)
+                pose: pycolmap.Rigid3d | str | None = pycolmap.Rigid3d()
                 if sensor:
                     pose = _pose([float(next(words)) for _ in range(7)]) if int(next(words)) else None
                 if kind == "CAMERA":
@@ -378,10 +385,10 @@ def _binary_rigs(path: Path, model: ColmapModel) -> None:
     file = _Binary(path)
     for _ in file:
         rig_id, count = file.read("II")
-        cameras = dict[int, Floats | None]()
+        cameras = dict[int, pycolmap.Rigid3d | None]()
         for sensor in range(count):
             kind, sensor_id = file.read("iI")
-            pose: Floats | str | None = np.eye(4)
+            pose: pycolmap.Rigid3d | str | None = pycolmap.Rigid3d()
             if sensor:
                 pose = _pose(file.read("7d")) if file.read("B")[0] else None
             if kind == _CAMERA:

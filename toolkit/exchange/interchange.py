@@ -26,7 +26,14 @@ from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.images import decode, exif_camera, is_file, read_header
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError, ImageError, ManifestError
-from toolkit.exchange.colmap_model import NORM_TOLERANCE, encoding_of, is_number, read_cameras, read_model
+from toolkit.exchange.colmap_model import (
+    NORM_TOLERANCE,
+    encoding_of,
+    inverse,
+    is_number,
+    read_cameras,
+    read_model,
+)
 from toolkit.exchange.drafts import (
     HEIC_SUFFIXES,
     READ_SUFFIXES,
@@ -99,7 +106,7 @@ def import_colmap(
     for rig_id, cameras in sorted(content.rigs.items()):
         calibrated = {camera_id: pose for camera_id, pose in sorted(cameras.items()) if pose is not None}
         draft.rigs += [
-            (f"{SUBSESSION}/rig_{rig_id}", sensors[rig_id, camera_id], invert(sensor_from_rig))
+            (f"{SUBSESSION}/rig_{rig_id}", sensors[rig_id, camera_id], inverse(sensor_from_rig))
             for camera_id, sensor_from_rig in calibrated.items()
         ]
     moved, names, not_in_model = 0, set[str](), set[str]()
@@ -112,14 +119,16 @@ def import_colmap(
             sensor_from_rig = content.rigs[frame.rig_id].get(image.camera_id)
             pose = "its camera has no pose in its rig" if sensor_from_rig is None else frame.rig_from_world
             if not (sensor_from_rig is None or isinstance(pose, str) or isinstance(image.cam_from_world, str)):
-                moved += not np.allclose(sensor_from_rig @ pose, image.cam_from_world, rtol=1e-4, atol=1e-4)
+                moved += not np.allclose(
+                    (sensor_from_rig * pose).matrix(), image.cam_from_world.matrix(), rtol=1e-4, atol=1e-4
+                )
         if image.name in names:
             draft.rows.append({"image": image.name, "status": "its name occurs twice in the model"})
         elif isinstance(camera, str) or isinstance(pose, str):
             draft.rows.append({"image": image.name, "status": camera if isinstance(camera, str) else pose})
         else:
             draft.images.append(DraftImage(image.name, camera, sensor, f"{frame_id}", rig_name))
-            draft.poses[f"{frame_id}"] = invert(pose)
+            draft.poses[f"{frame_id}"] = inverse(pose)
         names.add(image.name)
     if moved:
         draft.notes.append(f"{moved} images have another pose than their rig gives them: that of the rig is taken")
@@ -289,7 +298,7 @@ def _is_transforms(table: str | Path | None) -> bool:
     return table is not None and Path(table).suffix == ".json"
 
 
-def _sensors_of_rigs(rigs: Mapping[int, Mapping[int, Floats | None]]) -> dict[tuple[int, int], str]:
+def _sensors_of_rigs(rigs: Mapping[int, Mapping[int, pycolmap.Rigid3d | None]]) -> dict[tuple[int, int], str]:
     """Return the sensor's name by rig and camera: a camera that is in several rigs becomes a sensor of each."""
     of_camera = Counter(camera_id for cameras in rigs.values() for camera_id in cameras)
     return {
