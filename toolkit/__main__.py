@@ -60,6 +60,8 @@ Unit = Annotated[float | None, Option(metavar="METERS", help="Meters per unit of
 MatchNames = Annotated[
     bool, Option("--match-names", help="Take files whose names differ only in case, extension or separators.")
 ]
+Gps = Annotated[bool, Option("--gps", help="Move the world to x east, y north, z up, in meters, by GPS in EXIF.")]
+Positions = Annotated[Path | None, Option(help="CSV: image,x,y,z, known camera centers in meters.")]
 _APPLIED = "Undo applied_transform and applied_scale, by which nerfstudio has changed the world of its input."
 _NAMES = "Name imported images as in your folder (own), or as in the capture (capture)."
 Names = Annotated[str, Option("--names", metavar="own|capture|file", help=_NAMES)]
@@ -331,13 +333,16 @@ def import_colmap(
     match_names: MatchNames = False,
     placing: Placing = "link",
     masks: Masks = None,
+    gps: Gps = False,
+    positions: Positions = None,
 ) -> None:
     """Make a session from a COLMAP model: cameras, poses, rigs."""
     from toolkit.exchange import interchange
 
     report = interchange.import_colmap(
-        model, images, capture, device, split, placing, axes, unit, hold_out, match_names, masks
-    )
+        model, images, capture, device, split, placing, axes, unit, hold_out, match_names, masks, gps,
+        positions,
+    )  # fmt: skip
     print(report.text())
 
 
@@ -364,13 +369,15 @@ def import_images(
     match_names: MatchNames = False,
     placing: Placing = "link",
     masks: Masks = None,
+    gps: Gps = False,
+    positions: Positions = None,
 ) -> None:
     """Make a session from a folder of images: a map with poses, or queries."""
     from toolkit.exchange import interchange
 
     report = interchange.import_images(
         images, capture, device, split, table, poses_are, camera, cameras, placing, axes, unit, truth, hold_out,
-        match_names, only, skip, masks,
+        match_names, only, skip, masks, gps, positions,
     )  # fmt: skip
     print(report.text())
 
@@ -451,7 +458,7 @@ def reconstruct(
     distance: Annotated[
         tuple[str, str, float] | None, Option(metavar="IMAGE:X,Y IMAGE:X,Y METERS", help=_DISTANCE)
     ] = None,
-    positions: Annotated[Path | None, Option(help="CSV: image,x,y,z, known camera centers in meters.")] = None,
+    positions: Positions = None,
     mapper: Annotated[str, Option(metavar="incremental|global", help="COLMAP's mapper.")] = "incremental",
     placing: Placing = "link",
     masks: Masks = None,

@@ -11,8 +11,9 @@ import pycolmap
 import pytest
 
 from toolkit.capture import Capture
-from toolkit.errors import CaptureError
+from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.colmap_model import read_model
+from toolkit.exchange.georeference import geographic
 from toolkit.exchange.interchange import import_colmap
 from toolkit.geometry import Floats, invert, make_pose, quaternion_to_rotation
 
@@ -56,7 +57,7 @@ def assert_read(folder: Path, atol: float = 1e-9) -> None:
     images = read_model(folder).images.values()
     assert [image.name for image in images] == NAMES
     for number, image in enumerate(images):
-        np.testing.assert_allclose(image.cam_from_world, pose(number), rtol=0, atol=atol)
+        np.testing.assert_allclose(image.cam_from_world.matrix(), pose(number)[:3], rtol=0, atol=atol)
 
 
 POINTS = "".join(f"{x}.5 7 {x % 3 - 1} " for x in range(5)).strip() + "\n"
@@ -90,16 +91,17 @@ def test_text_is_read_however_it_was_written(change: Callable[[str], str | bytes
 
 def test_exponents_of_three_digits_are_read(tmp_path: Path) -> None:
     line = "1 1.000e+000 0 0 0 -2.5e-002 1e+001 3E+000 1 a.jpg"
-    np.testing.assert_array_equal(read_model(write(tmp_path, line)).images[1].cam_from_world[:3, 3], [-0.025, 10, 3])
+    found = read_model(write(tmp_path, line)).images[1].cam_from_world
+    np.testing.assert_array_equal(found.translation, [-0.025, 10, 3])
 
 
 def test_quaternions_of_few_digits_are_normalized_and_positions_do_not_scale(tmp_path: Path) -> None:
     model = read_model(write(tmp_path, images_txt(digits=3)))
     for number, image in enumerate(model.images.values()):
-        center, expected = invert(image.cam_from_world)[:3, 3], invert(pose(number))[:3, 3]
-        rotation = image.cam_from_world[:3, :3]
+        center, expected = image.cam_from_world.inverse().translation, invert(pose(number))[:3, 3]
+        rotation = image.cam_from_world.rotation.matrix()
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-        assert np.linalg.norm(center) == pytest.approx(np.linalg.norm(image.cam_from_world[:3, 3]), rel=1e-12)
+        assert np.linalg.norm(center) == pytest.approx(np.linalg.norm(image.cam_from_world.translation), rel=1e-12)
         np.testing.assert_allclose(center, expected, atol=1.0)
 
 
@@ -269,3 +271,58 @@ def test_the_folder_of_models(tmp_path: Path) -> None:
         read_model(tmp_path)
     with pytest.raises(CaptureError, match=r"expected a COLMAP model"):
         read_model(Path(__file__).parent)
+
+
+@pytest.mark.parametrize("by", ["positions", "gps"])
+def test_a_model_is_aligned_to_known_places(by: str, tmp_path: Path) -> None:
+    """A model in another world and unit, with a rig, comes out in the world of its camera centers."""
+    rng = np.random.default_rng(5)
+    count, origin = 12, np.array([47.0, 8.0, 400.0])
+    truth = [make_pose(quaternion_to_rotation(rng.normal(size=4)), rng.uniform(-60, 60, 3)) for _ in range(count)]
+    turn, scale, shift = quaternion_to_rotation([0.3, 0.5, -0.7, 0.2]), 0.05, np.array([3.0, -1.0, 2.0])
+    given = [make_pose(turn @ p[:3, :3], scale * turn @ p[:3, 3] + shift) for p in truth]  # world_from_cam
+    lines = []
+    for k, pose_given in enumerate(given, start=1):
+        moved = pycolmap.Rigid3d(invert(pose_given)[:3])
+        q = moved.rotation.quat
+        lines.append(" ".join(f"{v:.17g}" for v in (k, q[3], *q[:3], *moved.translation)) + f" 1 {k}.jpg\n\n")
+        exif, degrees = PIL.Image.Exif(), geographic(truth[k - 1][None, :3, 3], origin)[0]
+        gps = {1: "N", 2: (degrees[0], 0.0, 0.0), 3: "E", 4: (degrees[1], 0.0, 0.0), 6: degrees[2]}
+        exif.get_ifd(0x8825).update(gps if by == "gps" else {})
+        (tmp_path / "photos").mkdir(exist_ok=True)
+        PIL.Image.new("RGB", (64, 48)).save(tmp_path / "photos" / f"{k}.jpg", exif=exif)
+    folder = write(tmp_path / "model", "".join(lines))
+    rows = [f"{k}.jpg," + ",".join(f"{v:.9f}" for v in p[:3, 3]) for k, p in enumerate(truth, start=1)]
+    (tmp_path / "t.csv").write_text("\n".join(["image,x,y,z", *rows]))
+    options = {"gps": True} if by == "gps" else {"positions": tmp_path / "t.csv"}
+    report = import_colmap(folder, tmp_path / "photos", tmp_path / "PLACE", **options)
+    capture = Capture.open(tmp_path / "PLACE")
+    assert capture.unit == "m"
+    assert any(note.startswith("meters: from") for note in report.notes)
+    found = capture["ios_map"].world_from_cam()
+    names = [int(Path(path).stem) - 1 for path in capture["ios_map"].images["path"]]
+    expected = np.stack([truth[k] for k in names])
+    if by == "gps":  # in the frame at the median position
+        assert "origin" in report.session.joinpath("proc/import.json").read_text()
+        expected[:, :3, 3] += (found - expected)[:, :3, 3].mean(axis=0)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=0.02 if by == "gps" else 1e-5)
+    with pytest.raises(ManifestError, match="unit"):
+        import_colmap(folder, tmp_path / "photos", tmp_path / "OTHER", unit_m=1.0, **options)
+
+
+def test_a_model_without_gps_says_so(tmp_path: Path, photos: Path) -> None:
+    report = import_colmap(rig_model(tmp_path / "model"), photos, tmp_path / "PLACE", device="hl", gps=True)
+    assert any("no photograph has GPS" in note for note in report.notes)
+    assert Capture.open(tmp_path / "PLACE").unit is None
+
+
+@pytest.mark.parametrize("form", ["txt", "bin"])
+def test_poses_are_those_of_colmaps_own_reader(form: str, tmp_path: Path) -> None:
+    folder = write(tmp_path / "model", images_txt().replace(" of 3 ", "").replace("IMG (1)", "b"))
+    folder = binary(folder, tmp_path / "bin") if form == "bin" else folder
+    (folder / "points3D.txt").touch()
+    expected = pycolmap.Reconstruction(str(folder)).images
+    found = read_model(folder).images
+    assert found.keys() == set(expected)
+    for number, image in found.items():
+        np.testing.assert_array_equal(image.cam_from_world.matrix(), expected[number].cam_from_world().matrix())

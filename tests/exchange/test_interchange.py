@@ -1,6 +1,7 @@
 """Import: COLMAP models and folders of images become sessions; what cannot be used is said."""
 
 import struct
+import sys
 import zlib
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from typer.testing import CliRunner
 from toolkit.__main__ import app
 from toolkit.capture import Capture, Session
 from toolkit.capture.check import check_capture
-from toolkit.capture.images import exif_camera, read_number
+from toolkit.capture.images import exif_camera, read_image, read_number
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.interchange import import_colmap, import_images
 from toolkit.geometry import invert, make_pose, pose_from_qt, qt_from_pose, quaternion_to_rotation
@@ -390,6 +391,19 @@ def test_names_that_differ_a_little_from_their_files(listed: str, stored: str, f
     np.testing.assert_allclose(poses_of(Capture.open(tmp_path / "PLACE")["ios_map"])[stored], pose(3), atol=1e-9)
 
 
+def test_names_that_are_not_utf8(tmp_path: Path) -> None:
+    save(tmp_path / "photos" / "caf\u00e9.jpg")
+    (tmp_path / "photos" / "m\udcfcller.jpg").write_bytes((tmp_path / "photos" / "caf\u00e9.jpg").read_bytes())
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "cameras.txt").write_text("1 PINHOLE 64 48 50 51 32 24\n")
+    lines = "1 1 0 0 0 1 2 3 1 caf\u00e9.jpg\n\n2 1 0 0 0 1 2 3 1 m\u00fcller.jpg\n\n"
+    (tmp_path / "model" / "images.txt").write_text(lines, encoding="cp1252")
+    report = import_colmap(tmp_path / "model", tmp_path / "photos", tmp_path / "PLACE")
+    status = report.images.set_index("image")["status"]
+    assert status["caf\u00e9.jpg"] == "imported"
+    assert "not UTF-8" in status.drop("caf\u00e9.jpg").iloc[0]
+
+
 def test_names_that_fit_two_files_are_not_guessed(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     for name in ("img.jpg", "IMG.png", "good.jpg"):
@@ -399,7 +413,10 @@ def test_names_that_fit_two_files_are_not_guessed(tmp_path: Path) -> None:
     assert report.images.set_index("image")["status"].to_dict() == {"Img.jpg": "no such file", "good.jpg": "imported"}
 
 
-def test_files_that_are_not_photographs_are_said(folder: Path, tmp_path: Path) -> None:
+def test_files_that_are_not_photographs_are_said(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
     for name in ("x.heic", "y.HEIC", "z.gif"):
         (folder / name).write_bytes(b"anything")
     (folder / "caf\udce9.jpg").write_bytes(b"not Unicode")
@@ -411,6 +428,27 @@ def test_files_that_are_not_photographs_are_said(folder: Path, tmp_path: Path) -
     assert "2 files .heic are not read: pip install" in text
     assert "1 files .gif are not read" in text
     assert "1 images have a name that is not UTF-8" in text
+    assert check_capture(tmp_path / "PLACE", deep=True).problems == []
+
+
+@pytest.mark.parametrize(("size", "said"), [((62, 47), "cropped"), ((32, 24), "by 0.5"), ((128, 96), "by 2")])
+def test_a_crop_is_not_a_smaller_image(size: tuple[int, int], said: str, tmp_path: Path) -> None:
+    save(tmp_path / "photos" / "a.jpg", size)
+    save(tmp_path / "photos" / "b.jpg")
+    status = import_images(tmp_path / "photos", tmp_path / "PLACE", camera=CAMERA).images.set_index("image")["status"]
+    assert said in status["a.jpg"]
+    assert ("multiply" in status["a.jpg"]) == (said != "cropped")
+
+
+def test_heic_is_read_with_its_package(folder: Path, tmp_path: Path) -> None:
+    pillow_heif = pytest.importorskip("pillow_heif")
+    pillow_heif.register_heif_opener()
+    shade = np.tile(np.arange(0, 256, 4, dtype=np.uint8), (48, 1))
+    PIL.Image.fromarray(np.stack([shade] * 3, axis=-1)).save(folder / "p.HEIC", quality=95)
+    report = import_images(folder, tmp_path / "PLACE", camera=CAMERA)
+    assert "p.HEIC.png" in set(report.images["image"])
+    path = tmp_path / "PLACE" / "sessions" / "ios_query" / "raw_data" / "import" / "images" / "p.HEIC.png"
+    assert np.abs(read_image(path, gray=True).astype(int) - shade).max() < 16
     assert check_capture(tmp_path / "PLACE", deep=True).problems == []
 
 
@@ -536,6 +574,16 @@ def test_time_zones_that_change_are_applied(tmp_path: Path) -> None:
     save(photos / "b.jpg", time="2026:10:25 02:15:00", tags={0x9011: "+02:00"})
     report = import_images(photos, tmp_path / "SAME", camera=CAMERA)
     assert report.images.set_index("image")["timestamp"]["a.jpg"] == times["a.jpg"] + 2 * 3600 * 10**6, "the clock's"
+
+
+def test_a_crop_keeps_the_focal_length_of_the_whole_image(tmp_path: Path) -> None:
+    tags = {0xA405: 28, 0xA002: 128, 0xA003: 96}
+    whole = 28 * np.hypot(128, 96) / np.hypot(36, 24)
+    sizes = {"crop": ((64, 30), whole), "turned": ((96, 128), whole), "small": ((64, 48), whole / 2)}
+    for name, (size, expected) in sizes.items():
+        camera, said = exif_camera(save(tmp_path / f"{name}.jpg", size, tags))
+        assert camera.params[0] == pytest.approx(expected)
+        assert ("cropped" in said) == (name == "crop")
 
 
 @pytest.mark.parametrize("orientation", [0, 9, 65535])

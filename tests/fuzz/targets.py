@@ -24,7 +24,6 @@ from toolkit.capture import Capture, Session
 from toolkit.capture.check import check_capture
 from toolkit.capture.tables import read_query_table
 from toolkit.errors import ToolkitError
-from toolkit.exchange import interchange
 from toolkit.exchange.hloc import import_features
 from toolkit.exchange.interchange import import_colmap, import_images
 from toolkit.files import read_references
@@ -366,7 +365,6 @@ def check_colmap(data: bytes) -> None:
     shutil.rmtree(model, ignore_errors=True)
     shutil.copytree(folder / kind, model)
     (model / place.partition("/")[2]).write_bytes(data[1:])
-    interchange.PROBE_S = 10
     try:
         if not refused(lambda: import_colmap(model, images, capture), "damaged", "images"):
             use_session(Capture.open(capture)["ios_map"])

@@ -279,8 +279,8 @@ class _SessionCheck:
         gone[exist] = [not os.path.exists(f"{self.session.path}/{RAW_DATA}/{name}") for name in listed[exist]]  # noqa: PTH110
         if gone.any():
             self.missing[file] += int(gone.sum())
-            target = os.readlink(f"{self.session.path}/{RAW_DATA}/{listed[gone][0]}")  # noqa: PTH115
-            found = f"{gone.sum()} of {len(rows)} files are links to files that are gone, such as {target}"
+            lost = os.readlink(f"{self.session.path}/{RAW_DATA}/{listed[gone][0]}")  # noqa: PTH115
+            found = f"{gone.sum()} of {len(rows)} files are links to files that are gone, such as {lost}"
             do = "Move them back, or remove the session and import again; --images copy does not depend on them"
             self._add(file, int(rows.index[gone][0]), f"{found}. {do}")
         self._check_content(file, rows[exist & inside & ~gone])

@@ -44,7 +44,7 @@ _CGROUPS = Path("/sys/fs/cgroup")  # file names differ between versions 2 and 1
 HEADER_ERRORS = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
 # Numbers of the EXIF tags, and the length in millimeters of each value of FocalPlaneResolutionUnit.
 ORIENTATION, _EXIF, _TIME, _SUBSECOND, _ZONE = 0x0112, 0x8769, 0x9003, 0x9291, 0x9011
-_FOCAL_MM, _FOCAL_35MM, _WIDTH = 0x920A, 0xA405, 0xA002
+_FOCAL_MM, _FOCAL_35MM, _WIDTH, _HEIGHT = 0x920A, 0xA405, 0xA002, 0xA003
 _PLANE_X, _PLANE_UNIT = 0xA20E, 0xA210
 _UNIT_MM = {0.0: 25.4, 2.0: 25.4, 3.0: 10.0, 4.0: 1.0}  # 0, a missing tag, means inches
 _MASK_DEPTH = 4  # largest number of folders and files in the path of an image below the folder of images
@@ -331,7 +331,8 @@ def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
     """Guess the intrinsics of an image from its EXIF tags: no distortion, principal point in the image center.
 
     FocalLengthIn35mmFilm refers to the diagonal of 36 mm x 24 mm film (CIPA DC-008). Without that tag, the focal length
-    is FocalLength times FocalPlaneXResolution, scaled if the image was resized later.
+    is FocalLength times FocalPlaneXResolution, scaled if the image was resized later. An image whose sides have another
+    ratio than in EXIF was cropped; the tags are those of the whole image.
 
     Returns:
         A SIMPLE_PINHOLE camera, and a phrase that names the tags used.
@@ -342,16 +343,22 @@ def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
     (width, height), exif = read_header(path)
     focal_mm, film_mm = read_number(exif, _FOCAL_MM), read_number(exif, _FOCAL_35MM)
     plane_x, unit_mm = read_number(exif, _PLANE_X), _UNIT_MM.get(read_number(exif, _PLANE_UNIT))
+    whole = sorted([read_number(exif, _WIDTH), read_number(exif, _HEIGHT)])
+    sides = sorted([width, height])
+    cropped = whole[0] > 0 and abs(whole[1] * sides[0] / (whole[0] * sides[1]) - 1) > 0.02
+    cropped = cropped and sides[0] <= whole[0] and sides[1] <= whole[1]
     if film_mm > 0:
-        focal_px, how = film_mm * np.hypot(width, height) / _FILM_DIAGONAL_MM, "FocalLengthIn35mmFilm"
+        diagonal = np.hypot(*(whole if cropped else sides))
+        focal_px, how = film_mm * diagonal / _FILM_DIAGONAL_MM, "FocalLengthIn35mmFilm"
     elif focal_mm > 0 and plane_x > 0 and unit_mm:
         stored = read_number(exif, _WIDTH)
-        focal_px = focal_mm * plane_x / unit_mm * (width / stored if stored > 0 else 1.0)
+        focal_px = focal_mm * plane_x / unit_mm * (width / stored if stored > 0 and not cropped else 1.0)
         how = "FocalLength and FocalPlaneXResolution"
     else:
         such_as = f"'SIMPLE_PINHOLE,{width},{height},FOCAL_PX,{width / 2:g},{height / 2:g}'"
         options = f"--camera 'MODEL,W,H,...', such as {such_as}, with --cameras, or in the table"
         raise ImageError(f"no focal length in EXIF: give the intrinsics with {options}")
+    how += " of the whole image, which was cropped" if cropped else ""
     params = [float(focal_px), width / 2, height / 2]
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
     return camera, f"a guess from EXIF ({how}), without distortion"

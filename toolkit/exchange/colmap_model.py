@@ -8,7 +8,7 @@ import codecs
 import mmap
 import re
 import struct
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,13 +20,15 @@ import pycolmap
 from toolkit.capture.cameras import parse_camera
 from toolkit.capture.tables import FARTHEST_M
 from toolkit.errors import CaptureError
-from toolkit.geometry import Floats, pose_from_qt
+from toolkit.geometry import Floats, make_pose
 
 NORM_TOLERANCE = 0.01
 """Deviation from 1 of the length of a quaternion that counts as rounding."""
 _CAMERA = 0
 """Type of the sensors that are cameras, in .bin files."""
 _SUFFIXES = (".bin", ".txt")
+_LATER_CHANGED = int(pycolmap.CameraModelId.RAD_TAN_THIN_PRISM_FISHEYE)
+"""Model that had 14 parameters in earlier versions of COLMAP."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +37,8 @@ class ModelImage:
 
     name: str
     camera_id: int
-    cam_from_world: Floats | str
-    """(4, 4), or why there is no pose."""
+    cam_from_world: pycolmap.Rigid3d | str
+    """The pose, or why there is none."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +46,8 @@ class ModelFrame:
     """What the sensors of a rig measured at one instant."""
 
     rig_id: int
-    rig_from_world: Floats | str
-    """(4, 4), or why there is no pose."""
+    rig_from_world: pycolmap.Rigid3d | str
+    """The pose, or why there is none."""
     image_ids: Sequence[int]
 
 
@@ -56,8 +58,8 @@ class ColmapModel:
     cameras: dict[int, pycolmap.Camera | str] = field(default_factory=dict)
     """Each camera, or why it cannot be used."""
     images: dict[int, ModelImage] = field(default_factory=dict)
-    rigs: dict[int, dict[int, Floats | None]] = field(default_factory=dict)
-    """sensor_from_rig (4, 4) by camera, of all rigs with several sensors; None for a camera that is not calibrated."""
+    rigs: dict[int, dict[int, pycolmap.Rigid3d | None]] = field(default_factory=dict)
+    """sensor_from_rig by camera, of all rigs with several sensors; None for a camera that is not calibrated."""
     frames: dict[int, ModelFrame] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     """What a user should know of how the files were read."""
@@ -128,15 +130,37 @@ def _no_model(folder: Path, models: Sequence[Path]) -> CaptureError:
 # What both formats share
 
 
-def _pose(values: Sequence[float]) -> Floats | str:
-    """Return a pose (4, 4) of qw qx qy qz tx ty tz, or why it is none. The quaternion is normalized."""
-    row = np.array(values)
-    if not (np.abs(row) < FARTHEST_M).all():
-        return f"its pose is not finite: {', '.join(f'{value:g}' for value in values)}"
-    norm = float(np.linalg.norm(row[:4]))
-    if abs(norm - 1) > NORM_TOLERANCE:
-        return f"its quaternion has the length {norm:.4g}, expected 1"
-    return pose_from_qt(np.r_[row[:4] / norm, row[4:]])
+def _pose(values: Sequence[float]) -> pycolmap.Rigid3d | str:
+    return _poses([values])[0]
+
+
+def _poses(rows: Sequence[Sequence[float]]) -> list[pycolmap.Rigid3d | str]:
+    """Return the pose of each row qw qx qy qz tx ty tz, or why it is none. Quaternions are normalized."""
+    table = np.array(rows, np.float64).reshape(-1, 7)
+    finite = np.all(np.abs(table) < FARTHEST_M, axis=1)
+    lengths = np.linalg.norm(np.where(finite[:, None], table[:, :4], 0.0), axis=1)
+    valid = np.abs(lengths - 1) <= NORM_TOLERANCE
+    poses: list[pycolmap.Rigid3d | str] = [f"its quaternion has the length {one:.4g}, expected 1" for one in lengths]
+    for index in np.flatnonzero(~finite).tolist():
+        poses[index] = f"its pose is not finite: {', '.join(f'{value:g}' for value in rows[index])}"
+    table[valid, :4] /= np.where(np.abs(lengths - 1) > 1e-12, lengths, 1.0)[valid, None]
+    for index in np.flatnonzero(valid).tolist():
+        poses[index] = pycolmap.Rigid3d(pycolmap.Rotation3d(table[index, [1, 2, 3, 0]]), table[index, 4:])
+    return poses
+
+
+def inverse(a_from_b: pycolmap.Rigid3d) -> Floats:
+    """Return b_from_a, (4, 4)."""
+    b_from_a = a_from_b.inverse()
+    return make_pose(b_from_a.rotation.matrix(), b_from_a.translation)
+
+
+def _set_images(model: ColmapModel, rows: Mapping[int, tuple[str, int, Sequence[float]]]) -> None:
+    """Set the images of a model: name, camera and pose by id. All poses are converted at once, which is faster."""
+    for (image_id, (name, camera_id, _)), pose in zip(
+        rows.items(), _poses([values for _, _, values in rows.values()]), strict=True
+    ):
+        model.images[image_id] = ModelImage(name, camera_id, pose)
 
 
 def _camera(
@@ -148,7 +172,7 @@ def _camera(
         return f"its camera cannot be used: {where}{error}"
 
 
-def _add_rig(model: ColmapModel, rig_id: int, cameras: dict[int, Floats | None], sensors: int) -> None:
+def _add_rig(model: ColmapModel, rig_id: int, cameras: dict[int, pycolmap.Rigid3d | None], sensors: int) -> None:
     if sensors > 1:
         model.rigs[rig_id] = cameras
 
@@ -202,7 +226,7 @@ def _text_cameras(path: Path, model: ColmapModel) -> None:
 
 def _text_images(path: Path, model: ColmapModel) -> None:
     expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of points"
-    points_follow, without_points = False, 0
+    points_follow, without_points, rows = False, 0, dict[int, tuple[str, int, Sequence[float]]]()
     for number, line in _lines(path):
         words = line.split(maxsplit=9)
         is_image = _is_image(words)
@@ -214,11 +238,11 @@ def _text_images(path: Path, model: ColmapModel) -> None:
                 values, image_id, camera_id = [float(word) for word in words[1:8]], int(words[0]), int(words[8])
             except ValueError:
                 raise _malformed(path, number, line, expected) from None
-            image_id = _new(path, "image", image_id, model.images)
-            model.images[image_id] = ModelImage(words[9], camera_id, _pose(values))
+            rows[_new(path, "image", image_id, rows)] = words[9], camera_id, values
             points_follow = True
         elif line:
             raise _malformed(path, number, line, expected)
+    _set_images(model, rows)
     if without_points:
         model.notes.append(f"{path.name}: {without_points} images have no line of points, which is not needed")
     with path.open(encoding=encoding_of(path), errors="replace") as file:
@@ -260,10 +284,10 @@ def _text_rigs(path: Path, model: ColmapModel) -> None:
         if not line:
             continue
         try:
-            rig_id, count, cameras = int(next(words)), int(next(words)), dict[int, Floats | None]()
+            rig_id, count, cameras = int(next(words)), int(next(words)), dict[int, pycolmap.Rigid3d | None]()
             for sensor in range(count):
                 kind, sensor_id = next(words), int(next(words))
-                pose: Floats | str | None = np.eye(4)
+                pose: pycolmap.Rigid3d | str | None = pycolmap.Rigid3d()
                 if sensor:
                     pose = _pose([float(next(words)) for _ in range(7)]) if int(next(words)) else None
                 if kind == "CAMERA":
@@ -338,27 +362,33 @@ def _binary_cameras(path: Path, model: ColmapModel) -> None:
             found = f"camera {camera_id} of the unknown model number {kind}"
             raise CaptureError(f"{path}: found {found}, expected one of {', '.join(known.values())}.")
         count = len(pycolmap.Camera.create_from_model_name(0, known[kind], 1.0, 1, 1).params)
-        camera = _camera(known[kind], size, file.read(f"{count}d"))
+        try:
+            params = file.read(f"{count}d")
+        except CaptureError as error:
+            older = f"{error} Or an older COLMAP wrote other parameters of {known[kind]}: export the model as .txt."
+            raise CaptureError(older if kind == _LATER_CHANGED else str(error)) from None
+        camera = _camera(known[kind], size, params)
         model.cameras[_new(path, "camera", camera_id, model.cameras)] = camera
 
 
 def _binary_images(path: Path, model: ColmapModel) -> None:
-    file = _Binary(path)
+    file, rows = _Binary(path), dict[int, tuple[str, int, Sequence[float]]]()
     for _ in file:
         image_id, *values, camera_id = file.read("I7dI")
-        model.images[_new(path, "image", image_id, model.images)] = ModelImage(file.name(), camera_id, _pose(values))
+        rows[_new(path, "image", image_id, rows)] = file.name(), camera_id, values
         (points,) = file.read("Q")
         file.skip(24 * points)
+    _set_images(model, rows)
 
 
 def _binary_rigs(path: Path, model: ColmapModel) -> None:
     file = _Binary(path)
     for _ in file:
         rig_id, count = file.read("II")
-        cameras = dict[int, Floats | None]()
+        cameras = dict[int, pycolmap.Rigid3d | None]()
         for sensor in range(count):
             kind, sensor_id = file.read("iI")
-            pose: Floats | str | None = np.eye(4)
+            pose: pycolmap.Rigid3d | str | None = pycolmap.Rigid3d()
             if sensor:
                 pose = _pose(file.read("7d")) if file.read("B")[0] else None
             if kind == _CAMERA:

@@ -20,7 +20,7 @@ import yaml
 from toolkit.capture import parse_camera
 from toolkit.capture.images import stored_size
 from toolkit.errors import CaptureError, ImageError, ManifestError
-from toolkit.exchange.colmap_model import read_model
+from toolkit.exchange.colmap_model import inverse, read_model
 from toolkit.exchange.drafts import Draft, ImportReport, start, write_drafts
 from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
 from toolkit.manifest import nearest
@@ -274,7 +274,7 @@ def _aachen(folder: Path) -> tuple[Path, list[Photograph]]:
     images = []
     for image in model.images.values():
         camera, pose = model.cameras.get(image.camera_id, "its camera is not in the model"), image.cam_from_world
-        images.append(Photograph(image.name, "map", camera, pose if isinstance(pose, str) else invert(pose)))
+        images.append(Photograph(image.name, "map", camera, pose if isinstance(pose, str) else inverse(pose)))
     for path in sorted(folder.glob("queries/*_with_intrinsics.txt")):
         for where, (name, *words) in _lines(path):
             images.append(Photograph(name, "query", _camera(where, ", ".join(words)), None))
@@ -286,7 +286,7 @@ def _eth3d(folder: Path) -> tuple[Path, list[Photograph]]:
     images = []
     for image in model.images.values():
         camera, pose = model.cameras.get(image.camera_id, "its camera is not in the model"), image.cam_from_world
-        images.append(Photograph(image.name, "", camera, pose if isinstance(pose, str) else invert(pose)))
+        images.append(Photograph(image.name, "", camera, pose if isinstance(pose, str) else inverse(pose)))
     return folder / "images", images
 
 

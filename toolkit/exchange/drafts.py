@@ -13,12 +13,12 @@ import unicodedata
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import PIL.Image
 import pycolmap
 
 from toolkit.capture import RAW_DATA, Trajectory, write_session
@@ -123,6 +123,7 @@ class Draft:
     given_times: int = 0  # images whose time is not from EXIF
     masks: Path | None = None  # folder of masks as COLMAP names them; None: see `images.find_mask`
     mask_files: dict[str, Path] = field(default_factory=dict)  # those that are not in `masks` under their names
+    record: dict[str, Any] = field(default_factory=dict)  # further content of `proc/import.json`
     match_names: bool = False  # take files whose names differ only in case, extension or separators
     sensors: dict[str, str] = field(default_factory=dict)  # id by `camera_text`, for images that are not in a rig
 
@@ -179,6 +180,7 @@ class Draft:
         queries.poses = {frame: pose for frame, pose in self.poses.items() if frame in held}
         self.poses = {frame: pose for frame, pose in self.poses.items() if frame not in held}
         queries.rigs, queries.unit, queries.sources = self.rigs, self.unit, self.sources
+        queries.record, queries.match_names = self.record, self.match_names
         queries.mask_files, queries.match_names = self.mask_files, self.match_names
         return queries
 
@@ -225,6 +227,10 @@ class Draft:
             self.notes.append(f"distortion that cannot be inverted near the edge of the image: {of}")
         self.rows += [{"image": name, "status": problem} for name, problem in problems.items() if problem]
         self.images = [image for image in self.images if not problems[image.name]]
+        for image in self.images:
+            if image.name.lower().endswith(HEIC_SUFFIXES):  # OpenCV cannot read it
+                self.sources[f"{image.name}.png"] = self.source(image.name)
+                image.name = f"{image.name}.png"
         if not self.images:
             name, status = (self.rows[0]["image"], self.rows[0]["status"]) if self.rows else ("", "there is none")
             where = " Names are paths in this folder: correct them in the list, or put the list beside the images."
@@ -236,7 +242,7 @@ class Draft:
     def _match_names(self) -> str:
         """Give images whose file is missing the file that their name probably means. Return a note, or an empty text.
 
-        Equal names in another Unicode form (macOS decomposes letters) are taken; those that differ in case, extension
+        Equal names in another encoding (macOS decomposes letters) are taken; those that differ in case, extension
         or separators with `match_names`, else only noted.
         """
         missing = [image for image in self.images if not is_file(self.source(image.name))]
@@ -246,7 +252,7 @@ class Draft:
         files = [name for name in walk_files(self.folder)[0] if name not in wanted]
         notes = []
         for key_of, taken, differ in (
-            (partial(unicodedata.normalize, "NFC"), True, "the Unicode form of letters"),
+            (_composed, True, "the encoding of letters"),
             (_loose, self.match_names, "case, extension or separators"),
         ):
             keys = Counter(key_of(image.name) for image in missing)
@@ -281,13 +287,16 @@ class Draft:
             files += [(path, session / MASKS / f"{IMPORTED}{name}.png") for name, path in masks.items()]
             for source, target in files:
                 target.parent.mkdir(parents=True, exist_ok=True)
-                if self.placing == "copy":
+                if source.name.lower().endswith(HEIC_SUFFIXES):
+                    with PIL.Image.open(source) as picture:
+                        picture.convert("RGB").save(target, exif=picture.getexif())
+                elif self.placing == "copy":
                     shutil.copyfile(source, target)
                 else:
                     target.symlink_to(os.path.abspath(source))  # noqa: PTH100 - must not resolve links in the source
             self._write_tables(session, times)
             table.to_csv(session / "proc" / "import.csv", index=False)
-            (session / IMPORT_RECORD).write_text(json.dumps({"unit": self.unit}) + "\n", encoding="utf-8")
+            (session / IMPORT_RECORD).write_text(json.dumps({"unit": self.unit} | self.record) + "\n", encoding="utf-8")
             if self.placing == "link":
                 note_linked_here(session)
         return ImportReport(self.session, table, self.notes)
@@ -321,8 +330,12 @@ class Draft:
             return "the capture format cannot hold the comma in its name"
         if image.name.startswith("/") or ".." in name.parts:
             return NOT_INSIDE
+        if printable(image.name) != image.name:
+            return "its name is not UTF-8: rename it"
         if is_bad_name(image.name):
             return f"the capture format cannot hold this name, expected {EXPECTED_NAME}"
+        if image.name.lower().endswith(HEIC_SUFFIXES) and not heic_is_read():
+            return f"HEIC is not read: {_HOW[HEIC_SUFFIXES[0]]}"
         try:
             size, exif = read_header(self.source(image.name))
         except ImageError as error:
@@ -339,7 +352,10 @@ class Draft:
         problem = f"the image is stored as {width} x {height} pixels, its camera has {camera.width} x {camera.height}"
         if abs(width * camera.height - height * camera.width) <= max(sides) / 2:  # equal ratio up to rounding
             factor = width / camera.width
-            problem += f"; use images of the camera's size, or multiply its intrinsics by {factor:.6g}"
+            is_crop = 0.9 < factor < 1.1  # nobody resizes by so little; undistortion and stabilization crop
+            problem += "; it seems to be cropped" if is_crop else ""
+            problem += "; use images of the camera's size"
+            problem += "" if is_crop else f", or multiply its intrinsics by {factor:.6g}"
         if 4 < orientation <= 8 and size == (camera.height, camera.width):
             problem += "; the camera fits the rotated image: rotate the pixels and remove the EXIF orientation"
         return problem
@@ -424,8 +440,8 @@ def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES, notes:
     names = sorted((name for name in files if name.lower().endswith(suffixes) and not _is_mask(name)), key=Path)
     broken = [name for name in names if printable(name) != name]
     names = [name for name in names if name not in set(broken)] if broken else names
-    others = Counter(Path(name).suffix.lower() for name in files if name.lower().endswith(PHOTOGRAPHS))
-    others = Counter({suffix: count for suffix, count in others.items() if suffix not in suffixes})
+    suffix_of = (name[name.rfind(".") :].lower() for name in files)
+    others = Counter(suffix for suffix in suffix_of if suffix in PHOTOGRAPHS and suffix not in suffixes)
     said = [f"{count} files {suffix} are not read: {_HOW.get(suffix, CONVERT)}" for suffix, count in others.items()]
     if broken:
         said.append(f"{len(broken)} images have a name that is not UTF-8: rename them; first: {printable(broken[0])}")
@@ -455,8 +471,19 @@ def walk_files(folder: Path) -> tuple[list[str], list[str]]:
                 folders.remove(link)
             else:
                 visited.append(target)
-        names += [Path(root, name).relative_to(folder).as_posix() for name in files]
+        inside = Path(root).relative_to(folder).as_posix()
+        names += files if inside == "." else [f"{inside}/{name}" for name in files]
     return names, captures
+
+
+def heic_is_read() -> bool:
+    """Tell whether Pillow reads HEIC, with the optional package pillow-heif."""
+    try:
+        import pillow_heif
+    except ImportError:
+        return False
+    pillow_heif.register_heif_opener()
+    return True
 
 
 def printable(name: str) -> str:
@@ -464,8 +491,15 @@ def printable(name: str) -> str:
     return name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 
 
+def _composed(name: str) -> str:
+    """Return a name with composed letters (NFC); one that is not UTF-8 is read as Windows writes it."""
+    if printable(name) != name:
+        name = name.encode("utf-8", "surrogateescape").decode("cp1252", "replace")
+    return unicodedata.normalize("NFC", name)
+
+
 def _loose(name: str) -> str:
-    name = unicodedata.normalize("NFC", name).replace("\\", "/").casefold()
+    name = _composed(name).replace("\\", "/").casefold()
     stem, dot, suffix = name.rpartition(".")
     return stem if f"{dot}{suffix}" in (*IMAGE_SUFFIXES, *PHOTOGRAPHS) else name
 

@@ -14,7 +14,7 @@ from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.files import own_name, read_json
-from toolkit.geometry import Floats, make_pose
+from toolkit.geometry import Floats, invert, make_pose
 
 MAX_ERRORS_M = (0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Limits of the error of a known position; the smallest that `MOST` of the positions meet is used."""
@@ -97,6 +97,27 @@ def place(
         record["origin"] = dict(zip(GEO_COLUMNS[:3], origin.tolist(), strict=True))
         record["axes"] = "x east, y north, z up"
     return Placing("m", record, [f"meters: from {how}, {facts}; up: by {by}"])
+
+
+def alignment(
+    world_from_cams: Mapping[str, Floats], quarter_turns: Mapping[str, int],
+    geo: Mapping[str, tuple[float, float, float]], positions: Mapping[str, Floats] | None,
+) -> tuple[Placing, pycolmap.Sim3d]:  # fmt: skip
+    """Return how `place` would transform posed images, (4, 4) by name, and that similarity, new_from_old."""
+    model = pycolmap.Reconstruction()
+    for number, (name, world_from_cam) in enumerate(world_from_cams.items(), start=1):
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(camera_id=number, model="SIMPLE_PINHOLE", width=2, height=2, params=[1, 1, 1])
+        )
+        image = pycolmap.Image(name, camera_id=number, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(invert(world_from_cam)[:3]))
+    before = np.vstack([np.zeros(3), np.eye(3)])
+    corners = [model.add_point3D(corner, pycolmap.Track()) for corner in before]
+    placed = place(model, quarter_turns, geo, None, positions)
+    origin, *axes = (np.asarray(model.points3D[corner].xyz) for corner in corners)
+    columns = np.stack(axes, axis=1) - origin[:, None]
+    scale = float(np.cbrt(np.linalg.det(columns)))
+    return placed, pycolmap.Sim3d(scale, pycolmap.Rotation3d(columns / scale), origin)
 
 
 def fit(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, Floats, float, float, bool] | None:

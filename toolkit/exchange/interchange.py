@@ -23,22 +23,33 @@ import pycolmap
 
 from toolkit.capture import parse_camera
 from toolkit.capture.folder import IMPORT_RECORD
-from toolkit.capture.images import decode, exif_camera
+from toolkit.capture.images import decode, exif_camera, is_file, read_header
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError, ImageError, ManifestError
-from toolkit.exchange.colmap_model import NORM_TOLERANCE, encoding_of, is_number, read_cameras, read_model
+from toolkit.exchange.colmap_model import (
+    NORM_TOLERANCE,
+    encoding_of,
+    inverse,
+    is_number,
+    read_cameras,
+    read_model,
+)
 from toolkit.exchange.drafts import (
+    HEIC_SUFFIXES,
     READ_SUFFIXES,
     SUBSESSION,
     Draft,
     DraftImage,
     ImportReport,
+    heic_is_read,
     list_images,
     posed_camera,
     require_convention,
     start,
     write_with_queries,
 )
+from toolkit.exchange.georeference import alignment, read_positions
+from toolkit.exchange.photographs import Photograph, gps_position
 from toolkit.exchange.transforms import import_transforms
 from toolkit.files import file_fingerprint, files_fingerprint, read_json, write_text
 from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
@@ -51,7 +62,7 @@ _CAMERA_COLUMNS = ("model", "width", "height", "params")
 def import_colmap(
     model: str | Path, images: str | Path, capture: str | Path, device: str = "ios", split: str = "map",
     placing: str = "link", axes: str = "opencv", unit_m: float | None = None, hold_out: int = 0,
-    match_names: bool = False, masks: str | Path | None = None,
+    match_names: bool = False, masks: str | Path | None = None, gps: bool = False, positions: str | Path | None = None,
 ) -> ImportReport:  # fmt: skip
     """Make a session from a COLMAP model and its images: cameras, poses, and the rigs that have several cameras.
 
@@ -71,6 +82,8 @@ def import_colmap(
         hold_out: every `hold_out`-th frame of a map, in order of names, becomes a query with ground truth instead;
             0: none.
         match_names: take files whose names differ only in case, extension or separators.
+        gps: move the world to x east, y north, z up, in meters, by the GPS in EXIF of at least three images.
+        positions: the same by a CSV file with the columns image, x, y, z: camera centers, meters.
         masks: folder of masks, see `images.find_mask`; they are placed as the images are.
 
     Raises:
@@ -93,7 +106,7 @@ def import_colmap(
     for rig_id, cameras in sorted(content.rigs.items()):
         calibrated = {camera_id: pose for camera_id, pose in sorted(cameras.items()) if pose is not None}
         draft.rigs += [
-            (f"{SUBSESSION}/rig_{rig_id}", sensors[rig_id, camera_id], invert(sensor_from_rig))
+            (f"{SUBSESSION}/rig_{rig_id}", sensors[rig_id, camera_id], inverse(sensor_from_rig))
             for camera_id, sensor_from_rig in calibrated.items()
         ]
     moved, names, not_in_model = 0, set[str](), set[str]()
@@ -106,14 +119,16 @@ def import_colmap(
             sensor_from_rig = content.rigs[frame.rig_id].get(image.camera_id)
             pose = "its camera has no pose in its rig" if sensor_from_rig is None else frame.rig_from_world
             if not (sensor_from_rig is None or isinstance(pose, str) or isinstance(image.cam_from_world, str)):
-                moved += not np.allclose(sensor_from_rig @ pose, image.cam_from_world, rtol=1e-4, atol=1e-4)
+                moved += not np.allclose(
+                    (sensor_from_rig * pose).matrix(), image.cam_from_world.matrix(), rtol=1e-4, atol=1e-4
+                )
         if image.name in names:
             draft.rows.append({"image": image.name, "status": "its name occurs twice in the model"})
         elif isinstance(camera, str) or isinstance(pose, str):
             draft.rows.append({"image": image.name, "status": camera if isinstance(camera, str) else pose})
         else:
             draft.images.append(DraftImage(image.name, camera, sensor, f"{frame_id}", rig_name))
-            draft.poses[f"{frame_id}"] = invert(pose)
+            draft.poses[f"{frame_id}"] = inverse(pose)
         names.add(image.name)
     if moved:
         draft.notes.append(f"{moved} images have another pose than their rig gives them: that of the rig is taken")
@@ -121,7 +136,12 @@ def import_colmap(
         not_in_model = set(list_images(draft.folder)) - names
     if not_in_model:
         draft.notes.append(f"{len(not_in_model)} images of the folder are not in the model")
-    draft.convert(axes, unit_m)
+    is_aligned = gps or positions is not None
+    if is_aligned and unit_m is not None:
+        raise ManifestError(f"unit: found {unit_m:g} together with GPS or positions, which tell the unit.")
+    draft.convert(axes, 1.0 if is_aligned else unit_m)
+    if is_aligned:
+        _align(draft, positions)
     return write_with_queries(draft, hold_out)
 
 
@@ -130,7 +150,7 @@ def import_images(
     poses_are: str = "world_from_cam", camera: str | None = None, cameras: str | Path | None = None,
     placing: str = "link", axes: str = "opencv", unit_m: float | None = 1.0, truth: str | Path | None = None,
     hold_out: int = 0, match_names: bool = False, only: Sequence[str] | None = None, skip: Sequence[str] | None = None,
-    masks: str | Path | None = None,
+    masks: str | Path | None = None, gps: bool = False, positions: str | Path | None = None,
 ) -> ImportReport:  # fmt: skip
     """Make a session from a folder of images without rigs.
 
@@ -151,7 +171,7 @@ def import_images(
         unit_m: meters per unit of the poses; None: unknown, see `import_colmap`.
         truth: CSV file like the table; its poses become the ground truth of queries. Images not in it are queries
             without ground truth.
-        hold_out, match_names: as for `import_colmap`.
+        hold_out, match_names, gps, positions: as for `import_colmap`.
         only, skip: patterns such as `*.color.png`, without a table; only images of these names, and none of those.
 
     Raises:
@@ -197,7 +217,9 @@ def import_images(
     if truth is not None:
         draft.notes.append(f"ground truth of {len(draft.poses)} of {len(rows)} images: {truth}")
     draft.notes += [f"intrinsics of {count} images: {origin}" for origin, count in origins.items()]
-    if poses:
+    if gps or positions is not None:
+        _align(draft, positions)
+    elif poses:
         draft.note_unit(unit_m)
     return write_with_queries(draft, hold_out)
 
@@ -276,7 +298,7 @@ def _is_transforms(table: str | Path | None) -> bool:
     return table is not None and Path(table).suffix == ".json"
 
 
-def _sensors_of_rigs(rigs: Mapping[int, Mapping[int, Floats | None]]) -> dict[tuple[int, int], str]:
+def _sensors_of_rigs(rigs: Mapping[int, Mapping[int, pycolmap.Rigid3d | None]]) -> dict[tuple[int, int], str]:
     """Return the sensor's name by rig and camera: a camera that is in several rigs becomes a sensor of each."""
     of_camera = Counter(camera_id for cameras in rigs.values() for camera_id in cameras)
     return {
@@ -289,9 +311,44 @@ def _sensors_of_rigs(rigs: Mapping[int, Mapping[int, Floats | None]]) -> dict[tu
 # Cameras
 
 
+def _align(draft: Draft, positions: str | Path | None) -> None:
+    """Move the poses of a draft to the world of known camera centers, or of GPS in EXIF: z is up, in meters.
+
+    If they do not tell it, the poses stay, and their unit is noted as unknown.
+    """
+    of_sensor = {(rig, sensor): rig_from_sensor for rig, sensor, rig_from_sensor in draft.rigs}
+    posed = [image for image in draft.images if image.frame in draft.poses and is_file(draft.source(image.name))]
+    poses = {image.name: draft.poses[image.frame] for image in posed}
+    poses |= {image.name: poses[image.name] @ of_sensor[image.rig, image.sensor] for image in posed if image.rig}
+    turns, geo = dict[str, int](), dict[str, tuple[float, float, float]]()
+    for name in poses:
+        with suppress(ImageError):
+            photograph = Photograph(name, draft.source(name), read_header(draft.source(name))[1], None)
+            turns[name] = photograph.quarter_turns
+        if positions is None and (position := gps_position(draft.source(name))) is not None:
+            geo[name] = position
+    known = None if positions is None else read_positions(Path(positions))
+    if poses:
+        placed, new_from_old = alignment(poses, turns, geo, known)
+        if placed.unit is not None:
+            rotation, scale = new_from_old.rotation.matrix(), new_from_old.scale
+            draft.poses = {
+                frame: make_pose(rotation @ pose[:3, :3], new_from_old * pose[:3, 3])
+                for frame, pose in draft.poses.items()
+            }
+            draft.rigs = [
+                (rig, sensor, make_pose(pose[:3, :3], scale * pose[:3, 3])) for rig, sensor, pose in draft.rigs
+            ]
+            draft.record |= placed.record
+            draft.notes += placed.notes
+            return
+        draft.notes += placed.notes[:-1] or ["no photograph has GPS" if known is None else "no image has a position"]
+    draft.note_unit(None)
+
+
 def _listed(draft: Draft, folder: Path, only: Sequence[str], skip: Sequence[str]) -> list[str]:
     """Return the images of a folder that fit the patterns, and note what is left out or looks like no photograph."""
-    names = list_images(folder, READ_SUFFIXES, draft.notes)
+    names = list_images(folder, (*READ_SUFFIXES, *(HEIC_SUFFIXES if heic_is_read() else ())), draft.notes)
     chosen = [name for name in names if not only or any(_fits(name, pattern) for pattern in only)]
     chosen = [name for name in chosen if not any(_fits(name, pattern) for pattern in skip)]
     if not chosen:

@@ -66,7 +66,7 @@ def gather(
         try:
             name, path = _converted(name, source, made)
             _, exif = read_header(path)
-            photographs.append(Photograph(name, path, exif, _position(path), find_mask(source, masks)))
+            photographs.append(Photograph(name, path, exif, gps_position(path), find_mask(source, masks)))
         except ImageError as error:
             unreadable[name] = str(error)
     twice = {item.name for item in photographs}
@@ -235,7 +235,7 @@ def _initial(path: Path, size: tuple[int, int]) -> pycolmap.Camera:
     return camera
 
 
-def _position(path: Path) -> tuple[float, float, float] | None:
+def gps_position(path: Path) -> tuple[float, float, float] | None:
     """Return latitude, longitude and altitude of the GPS tags; None without them."""
     try:
         with PIL.Image.open(path) as image:
