@@ -81,6 +81,7 @@ _FAILED = (
 )
 _SOURCES = "Image files, folders of images (a camera each) and videos; the last one is the folder of the new capture."
 _HELD_OUT = "Every Nth photograph becomes a query with truth, and the map is run and evaluated on them; 0: none."
+_REMOVE = "Remove the images of a folder, file or video that was added; give only CAPTURE."
 _DISTANCE = "Meters between two points, given by a pixel each, or between the cameras of two images."
 _TABLE = "CSV with a header: image; qw,qx,qy,qz,tx,ty,tz for poses; camera_id, or model,width,height,params."
 
@@ -462,26 +463,42 @@ def reconstruct(
     mapper: Annotated[str, Option(metavar="incremental|global", help="COLMAP's mapper.")] = "incremental",
     placing: Placing = "link",
     masks: Masks = None,
+    remove: Annotated[str | None, Option(metavar="RECORDING", help=_REMOVE)] = None,
 ) -> None:
-    """Make a map from photographs or videos without poses, by structure from motion."""
+    """Make a map from photographs or videos without poses, by structure from motion; or add them to the map of CAPTURE.
+
+    Poses that are in the map stay as they are.
+    """
     from toolkit import pipeline
     from toolkit.capture import Capture
+    from toolkit.exchange.grow import add_recording, remove_recording
     from toolkit.exchange.new_manifest import new_manifest
     from toolkit.exchange.reconstruct import FOLDER, reconstruct
     from toolkit.figures.explore import draw_top_view
 
-    if len(sources) < 2:
+    if (len(sources) != 1) if remove else (len(sources) < 2):
         raise ManifestError("reconstruct: expected photographs and then the folder of the new capture.")
     *photos, capture = sources
     manifest = Path("data_manifests") / f"{re.sub(r'[^A-Za-z0-9._-]', '-', capture.resolve().name)}.yaml"
     if manifest.exists() and str(capture) not in manifest.read_text(encoding="utf-8"):
         raise ManifestError(f"{manifest} is about another capture. Rename it, or give {capture} another name.")
-    result = reconstruct(
-        photos, capture, device, hold_out, fps, camera, distance, positions, mapper, placing, masks
-    )
-    print(result.text())
+    points: dict[str, Any] = {}
+    option = ""
+    if remove:
+        print("\n".join(remove_recording(remove, capture, device)))
+    elif (capture / "sessions" / f"{device}_map").exists():
+        first = {"hold-out": hold_out, "camera": camera, "distance": distance, "positions": positions, "masks": masks}
+        if given := next((name for name, value in first.items() if value), None):
+            raise ManifestError(f"--{given} is for a new map. {capture} has one, to which the photographs are added.")
+        print("\n".join(add_recording(photos, capture, device, fps)))
+    else:
+        result = reconstruct(
+            photos, capture, device, hold_out, fps, camera, distance, positions, mapper, placing, masks
+        )
+        print(result.text())
+        points, option = {"points": result.points, "colors": result.colors}, result.camera
     picture = capture / FOLDER / "cameras.png"
-    draw_top_view(Capture.open(capture), points=result.points, colors=result.colors).savefig(picture)
+    draw_top_view(Capture.open(capture), **points).savefig(picture)
     print(f"Picture: {picture}")
     if not manifest.exists():
         new_manifest(manifest.stem, capture)
@@ -491,7 +508,7 @@ def reconstruct(
         print(f"Report: {run_dir / 'report.html'}")
     print(f"Localize a photograph: python -m toolkit localize {run_dir} PHOTOGRAPH --picture above.png")
     if not hold_out:
-        print(f"Or many: python -m toolkit import images QUERIES {capture} --device {device}{result.camera}, and then")
+        print(f"Or many: python -m toolkit import images QUERIES {capture} --device {device}{option}, and then")
         print(f"python -m toolkit run {manifest}")
 
 

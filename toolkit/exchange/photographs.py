@@ -51,9 +51,11 @@ class Photograph:
 
 
 def gather(
-    sources: Sequence[Path], made: Path, fps: float | None = None, masks: Path | None = None
+    sources: Sequence[Path], made: Path, fps: float | None = None, masks: Path | None = None, prefixed: bool = False
 ) -> tuple[list[Photograph], dict[str, str]]:
     """Return the photographs of files, folders and videos, and the reason for each that cannot be read, by name.
+
+    Names are paths in the source. If there are several sources, or with `prefixed`, the source's name comes first.
 
     Frames of videos, and photographs in other formats than JPEG and PNG, are written to the folder `made`, once. For
     `masks` see `images.find_mask`.
@@ -62,7 +64,7 @@ def gather(
         CaptureError: a source is missing or is no image or video, or two photographs would have one name.
     """
     photographs, unreadable = list[Photograph](), dict[str, str]()
-    for name, source in _files(sources, made, fps):
+    for name, source in _files(sources, made, fps, prefixed or len(sources) > 1):
         try:
             name, path = _converted(name, source, made)
             _, exif = read_header(path)
@@ -78,10 +80,10 @@ def gather(
     return photographs, unreadable
 
 
-def _files(sources: Sequence[Path], made: Path, fps: float | None) -> Iterator[tuple[str, Path]]:
-    """Yield name and file of each image. Names start with the folder's name if there are several sources."""
+def _files(sources: Sequence[Path], made: Path, fps: float | None, prefixed: bool) -> Iterator[tuple[str, Path]]:
+    """Yield name and file of each image."""
     for source in sources:
-        prefix = f"{source.stem if source.is_file() else source.name}/" if len(sources) > 1 else ""
+        prefix = f"{source.stem if source.is_file() else source.resolve().name}/" if prefixed else ""
         if source.is_dir():
             for name in list_images(source, (*IMAGE_SUFFIXES, *OTHER_SUFFIXES, *VIDEO_SUFFIXES)):
                 if (source / name).absolute().is_relative_to(made.absolute().parents[1]):

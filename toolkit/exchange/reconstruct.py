@@ -8,7 +8,7 @@ database, and all models in COLMAP's format. The capture gets the largest model.
 import json
 import logging
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -140,6 +140,11 @@ class _Work:
         """For each kind, the verified matches (K, 2) of pairs of images."""
         self.matched: dict[tuple[int, int], int] = {}
         """Number of matches of each pair before verification."""
+        self.image_ids = list(range(1, len(self) + 1))
+        self.camera_ids = list(range(1, len(self.cameras) + 1))
+        """Those in COLMAP's database."""
+        self.in_model: dict[int, Floats] = {}
+        """Keypoints (N, 2) of images of an earlier model, which may have had more kinds, by image id."""
 
     def __len__(self) -> int:
         return len(self.names)
@@ -232,21 +237,22 @@ class _Work:
         path.unlink(missing_ok=True)
         offsets = np.zeros((len(self.kinds) + 1, len(self)), np.int64)
         with pycolmap.Database.open(str(path)) as database:
-            ids = []
-            for camera in self.cameras:
-                ids.append(database.write_camera(camera))
-                rig = pycolmap.Rig()
-                rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, ids[-1]))
-                database.write_rig(rig)
-            for image, name in enumerate(self.names):
-                camera_id = ids[self.camera_of[image]]
-                number = database.write_image(pycolmap.Image(name=name, camera_id=camera_id, image_id=image + 1), True)
-                frame = pycolmap.Frame(rig_id=camera_id)
+            for camera_id, camera in zip(self.camera_ids, self.cameras, strict=True):
+                camera.camera_id = camera_id
+                database.write_camera(camera, True)
+                rig = pycolmap.Rig(rig_id=camera_id)
+                rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id))
+                database.write_rig(rig, True)
+            for image, (number, name) in enumerate(zip(self.image_ids, self.names, strict=True)):
+                camera_id = self.camera_ids[self.camera_of[image]]
+                database.write_image(pycolmap.Image(name=name, camera_id=camera_id, image_id=number), True)
+                frame = pycolmap.Frame(frame_id=number, rig_id=camera_id)
                 frame.add_data_id(pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id), number))
-                database.write_frame(frame)
+                database.write_frame(frame, True)
                 keypoints = [self.keypoints(image, kind) for kind in range(len(self.kinds))]
                 offsets[1:, image] = np.cumsum([len(part) for part in keypoints])
-                database.write_keypoints(number, np.concatenate(keypoints).astype(np.float32))
+                points = self.in_model.get(number, np.concatenate(keypoints))
+                database.write_keypoints(number, points.astype(np.float32))
             both: dict[tuple[int, int], list[Ints]] = {}
             for kind, found in enumerate(self.pairs):
                 for pair, indices in found.items():
@@ -255,8 +261,9 @@ class _Work:
                 geometry = pycolmap.TwoViewGeometry()
                 geometry.config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
                 geometry.inlier_matches = np.concatenate(parts).astype(np.uint32)
-                database.write_matches(i + 1, j + 1, geometry.inlier_matches)
-                database.write_two_view_geometry(i + 1, j + 1, geometry)
+                ids = self.image_ids[i], self.image_ids[j]
+                database.write_matches(*ids, geometry.inlier_matches)
+                database.write_two_view_geometry(*ids, geometry)
         return path
 
     def map(self, mapper: str = "incremental") -> list[pycolmap.Reconstruction]:
@@ -295,8 +302,11 @@ class _Work:
             options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
         return options
 
-    def _refine(self, model: pycolmap.Reconstruction) -> None:
-        """Adjust poses, points and cameras under a robust loss, which halves errors (STRECHA), and drop outliers."""
+    def _refine(self, model: pycolmap.Reconstruction, fixed: Collection[int] = ()) -> None:
+        """Adjust poses, points and cameras under a robust loss, which halves errors (STRECHA), and drop outliers.
+
+        Images `fixed`, by their ids, keep their poses and cameras.
+        """
         scale = max(
             1.0, max(max(camera.width, camera.height) for camera in self.cameras) / SiftSettings().max_long_side
         )
@@ -309,11 +319,15 @@ class _Work:
             config = pycolmap.BundleAdjustmentConfig()
             for number in model.reg_image_ids():
                 config.add_image(number)
-            config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+            for image in (model.image(number) for number in fixed):
+                config.set_constant_rig_from_world_pose(image.frame_id)
+                config.set_constant_cam_intrinsics(image.camera_id)
+            if not fixed:
+                config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
             pycolmap.create_default_bundle_adjuster(options, config, model).solve()
             pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX * scale, MIN_ANGLE_DEG)
             for image in list(model.images.values()):  # a wrong pose keeps few points
-                if image.has_pose and image.num_points3D < MIN_POINTS:
+                if image.has_pose and image.num_points3D < MIN_POINTS and image.image_id not in fixed:
                     model.deregister_frame(image.frame_id)
 
 
@@ -525,11 +539,11 @@ def _hand_over(work: _Work, session: Path) -> None:
     """Give the features of a session's images to the session, where `extract_session` finds them."""
     for _, store in work.kinds:
         target = session / "proc" / "features" / store.path.name
-        if session.name == work.session.id:
+        if session.name == work.session.id and not target.exists():
             link_folder(store.path, target)
             continue
         with Items(store.path) as source, Items(target, source.made_by) as items:
             for name in Session.open(session).image_names:
                 made = f"{work.session.id}/{name.partition('/')[2]}"
-                if made in store:
-                    items.add(name, source.source(made), source[made])
+                if made in store and not items.is_current(name, store_source := source.source(made)):
+                    items.add(name, store_source, source[made])

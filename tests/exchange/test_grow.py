@@ -1,0 +1,118 @@
+"""A reconstructed map grows: what is there stays, to the last digit, and what was added can go again."""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image
+import pycolmap
+import pytest
+
+from toolkit.capture import Capture
+from toolkit.capture.check import check_capture
+from toolkit.errors import CaptureError
+from toolkit.exchange import grow
+from toolkit.exchange.grow import add_recording, remove_recording
+from toolkit.exchange.reconstruct import RECORD, reconstruct
+from toolkit.features.sift import SiftExtractor
+from toolkit.features.stores import extract_session
+from toolkit.files import read_json
+
+TABLES = ("images.txt", "trajectories.txt")
+
+
+@pytest.fixture(scope="module")
+def folders(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`first` has 4 photographs of the phone's map, `more` 2 others, `foreign` one of nothing."""
+    folder = tmp_path_factory.mktemp("folders")
+    session = Capture.open(small_capture)["ios_map"]
+    for row in range(len(session.images)):
+        target = folder / ("more" if row in (2, 4) else "first") / f"{row:03d}{session.image_path(row).suffix}"
+        target.parent.mkdir(exist_ok=True)
+        shutil.copy(session.image_path(row), target)
+    (folder / "foreign").mkdir()
+    noise = np.random.default_rng(0).integers(0, 255, (240, 320, 3), np.uint8)
+    PIL.Image.fromarray(noise).save(folder / "foreign" / "noise.png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def first(folders: Path) -> Path:
+    reconstruct([folders / "first"], folders / "PLACE")
+    return folders / "PLACE"
+
+
+def test_new_photographs_are_registered_and_the_others_stay(
+    folders: Path, first: Path, small_capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = first / "sessions" / "ios_map"
+    before = {name: (session / name).read_text() for name in TABLES}
+    extracted, extract = [], SiftExtractor.extract
+
+    def count(self: SiftExtractor, images: Sequence[Any]) -> Any:
+        extracted.extend(images)
+        return extract(self, images)
+
+    monkeypatch.setattr(SiftExtractor, "extract", count)
+    said = add_recording([folders / "more", folders / "foreign"], first)
+    assert said[0].startswith(f"2 of 3 photographs added to {session}, which has 6")
+    assert said[1].startswith("foreign/noise.png: no matches")
+    assert len(extracted) == 3
+    assert all((session / name).read_text().startswith(before[name]) for name in TABLES)
+    assert (read_json(session / RECORD)["photographs"], read_json(session / RECORD)["registered"]) == (7, 6)
+
+    opened, true = Capture.open(first)["ios_map"], Capture.open(small_capture)["ios_map"].world_from_cam()
+    order = [int(opened.image_path(row).stem) for row in range(6)]
+    assert sorted(order) == list(range(6))
+    ours, theirs = opened.world_from_cam()[:, :3, 3], true[order][:, :3, 3]
+    found = pycolmap.estimate_sim3d(ours[:4], theirs[:4])  # those of the first
+    assert found is not None
+    spread = np.linalg.norm(theirs - theirs.mean(axis=0), axis=1).mean()
+    assert np.linalg.norm(found * ours - theirs, axis=1).max() < 0.1 * spread
+    extract_session(opened, folders / "features")  # a run takes them all from the session
+    assert len(extracted) == 3
+
+    with pytest.raises(CaptureError, match=r"are in .* already"):
+        add_recording([folders / "more"], first)
+    with pytest.raises(CaptureError, match=r"found 0 of 6 images of recording 'mor'\. Recordings: more"):
+        remove_recording("mor", first)
+    assert remove_recording("more", first)[0].startswith("2 images of more removed")
+    assert {name: (session / name).read_text() for name in TABLES} == before
+    assert not list((session / "raw_data").rglob("more/*"))
+    assert add_recording([folders / "more"], first)[0].startswith("2 of 2 photographs added")
+
+
+def test_a_killed_addition_is_repeated(folders: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = tmp_path / "PLACE"
+    reconstruct([folders / "first"], place)
+    session = place / "sessions" / "ios_map"
+    before = (session / "images.txt").read_text()
+    write = grow.write_table
+
+    def kill(path: Path, *rest: Any) -> None:
+        if path.name == "images.txt":
+            raise KeyboardInterrupt
+        write(path, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(grow, "write_table", kill)
+        with pytest.raises(KeyboardInterrupt):
+            add_recording([folders / "more"], place)
+    assert (session / "images.txt").read_text() == before
+    assert len(Capture.open(place)["ios_map"].images) == 4
+    assert check_capture(place).ok
+    assert add_recording([folders / "more"], place)[0].startswith("2 of 2 photographs added")
+    assert np.isfinite(Capture.open(place)["ios_map"].world_from_cam()).all()
+    assert check_capture(place).ok
+
+
+def test_what_fits_nowhere_changes_nothing(folders: Path, first: Path, small_capture: Path) -> None:
+    session = first / "sessions" / "ios_map"
+    before = {name: (session / name).read_text() for name in TABLES}
+    with pytest.raises(CaptureError, match="no photograph fits into the model"):
+        add_recording([folders / "foreign"], first)
+    assert {name: (session / name).read_text() for name in TABLES} == before
+    with pytest.raises(CaptureError, match="was not reconstructed here"):
+        add_recording([folders / "foreign"], small_capture)

@@ -1,0 +1,239 @@
+"""Let a reconstructed map grow: add a recording to it, whose poses are found in the model, or remove one.
+
+Poses and cameras that are there stay as they are, to the last digit. A recording is the folder, file or video that was
+given; its name is the first part of the names of its images.
+"""
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pycolmap
+from tqdm.auto import tqdm
+
+from toolkit.capture import Session
+from toolkit.capture.cameras import camera_text
+from toolkit.capture.images import exif_key, read_header
+from toolkit.capture.names import LINKED_HERE
+from toolkit.capture.session import RAW_DATA
+from toolkit.capture.tables import write_table
+from toolkit.errors import CaptureError
+from toolkit.exchange.drafts import SUBSESSION
+from toolkit.exchange.photographs import Photograph, gather, initial_cameras
+from toolkit.exchange.reconstruct import FOLDER, RATIO, RECORD, _hand_over, _Mutual, _quiet, _reasons, _Work
+from toolkit.features.features import KINDS
+from toolkit.features.matching import LocalMethod
+from toolkit.features.sift import SiftExtractor
+from toolkit.files import IMPORTED, own_name, read_json, write_text
+from toolkit.geometry import Ints, make_pose, qt_from_pose
+from toolkit.store.items import heals
+
+
+@heals
+def add_recording(
+    sources: Sequence[str | Path], capture: str | Path, device: str = "ios", fps: float | None = None
+) -> list[str]:
+    """Register photographs into the model of a capture and add them to its map session; return what was done, in words.
+
+    Args:
+        sources, capture, device, fps: as for `reconstruct`; the map session was made by it.
+
+    Raises:
+        CaptureError: the session was not reconstructed, all photographs are in it already, or none fits into its model.
+    """
+    folder, session = Path(capture) / FOLDER, Path(capture) / "sessions" / f"{device}_map"
+    base = _model(folder, session)
+    old = _photographs(base, folder, session.name)
+    known = {item.path.resolve() for item in old.values()}
+    gathered, unreadable = gather(list(map(Path, sources)), folder / "images", fps, prefixed=True)
+    new = [item for item in gathered if item.path.resolve() not in known]
+    names = {item.name for item in old.values()}
+    if not new or any(item.name in names for item in new):
+        raise CaptureError(f"{sources[0]}: its photographs, or others of these names, are in {session} already.")
+    work = _Work(folder, device, [*old.values(), *new], None)
+    _keep_cameras(work, base, {item.name: number for number, item in old.items()})
+    work.extract(LocalMethod("sift", SiftExtractor(), _Mutual(RATIO, shorten=KINDS["sift"].shorten)), range(len(work)))
+    fixed = set(base.reg_image_ids())
+    is_new = [number not in fixed for number in work.image_ids]
+    work.match(0, [(i, j) for i, j in work.choose_pairs() if is_new[i] or is_new[j]])
+    work.pairs[0] |= _matches(base, work.image_ids)
+    model = _register(work, base, fixed)
+    added = [image for image in model.images.values() if image.has_pose and image.image_id not in fixed]
+    reasons = {name: why for name, why in _reasons(work, [model]).items() if name not in names} | unreadable
+    if not added:
+        raise CaptureError(f"{sources[0]}: no photograph fits into the model. {next(iter(reasons.items()))}.")
+    item_of = dict(zip(work.names, work.photographs, strict=True))
+    _append(session, sorted(added, key=lambda image: image.image_id), item_of, reasons)
+    _finish(folder, session, model)
+    _hand_over(work, session)
+    lines = [f"{len(added)} of {len(new) + len(unreadable)} photographs added to {session}, which has "
+             f"{model.num_reg_images()} in its model; their poses are as they were"]  # fmt: skip
+    return lines + [f"{name}: {why}" for name, why in list(reasons.items())[:20]]
+
+
+def remove_recording(name: str, capture: str | Path, device: str = "ios") -> list[str]:
+    """Remove the images whose names start with a recording's name from the map session; return what was done, in words.
+
+    Raises:
+        CaptureError: the session was not reconstructed, no image has such a name, or all have.
+    """
+    folder, session = Path(capture) / FOLDER, Path(capture) / "sessions" / f"{device}_map"
+    model, opened = _model(folder, session), Session.open(session)
+    gone = {one for one in opened.image_names if own_name(one).startswith(f"{name}/")}
+    if not 0 < len(gone) < len(opened.image_names):
+        recordings = sorted({own_name(one).partition("/")[0] for one in opened.image_names if "/" in own_name(one)})
+        found = f"{len(gone)} of {len(opened.image_names)} images of recording {name!r}"
+        raise CaptureError(f"{session}: found {found}. Recordings: {', '.join(recordings) or 'one, without a name'}.")
+    keys = {(str(row["timestamp"]), row["sensor_id"]) for row, one in
+            zip(opened.images.to_dict("records"), opened.image_names, strict=True) if one in gone}  # fmt: skip
+    _rewrite(session / "images.txt", lambda cells: (cells[0], cells[1]) not in keys)
+    _rewrite(session / "trajectories.txt", lambda cells: (cells[0], cells[1]) not in keys)
+    for image in [image for image in model.images.values() if image.name in gone and image.has_pose]:
+        model.deregister_frame(image.frame_id)
+    for one in gone:
+        (session / RAW_DATA / one.partition(f"/{RAW_DATA}/")[2]).unlink(missing_ok=True)
+    table = pd.read_csv(session / "proc" / "import.csv", dtype=str, keep_default_na=False)
+    table[~table["image"].str.startswith(f"{name}/")].to_csv(session / "proc" / "import.csv", index=False)
+    _finish(folder, session, model)
+    return [f"{len(gone)} images of {name} removed from {session}, which has {len(opened.image_names) - len(gone)} now"]
+
+
+def _model(folder: Path, session: Path) -> pycolmap.Reconstruction:
+    path = folder / "models" / "0"
+    if not (session / RECORD).is_file() or not path.is_dir():
+        raise CaptureError(f"{session} exists, but was not reconstructed here, so nothing can be added to its model.")
+    return pycolmap.Reconstruction(str(path))
+
+
+def _photographs(base: pycolmap.Reconstruction, folder: Path, session_id: str) -> dict[int, Photograph]:
+    """Return the photographs of a model by the number of the image."""
+    photographs, sessions = {}, folder / "sessions"
+    for number in sorted(base.reg_image_ids()):
+        name = base.image(number).name
+        path = (sessions / name).resolve()
+        photographs[number] = Photograph(own_name(name), path, read_header(path)[1], None)
+    return photographs
+
+
+def _keep_cameras(work: _Work, base: pycolmap.Reconstruction, number_of: dict[str, int]) -> None:
+    """Give images of the model their numbers and cameras; start those of equal size and EXIF at the same intrinsics."""
+    fresh = [item for item in work.photographs if item.name not in number_of]
+    camera_of, cameras = initial_cameras(fresh, None)
+    keys = {}
+    for item in work.photographs:
+        if item.name in number_of:
+            camera = base.cameras[base.image(number_of[item.name]).camera_id]
+            keys[camera.width, camera.height, *exif_key(item.exif)] = camera
+    for number, camera in enumerate(cameras):
+        item = fresh[camera_of.index(number)]
+        alike = keys.get((camera.width, camera.height, *exif_key(item.exif)))
+        if alike is not None:
+            cameras[number] = pycolmap.Camera(model=alike.model.name, width=alike.width, height=alike.height,
+                                              params=alike.params.tolist())  # fmt: skip
+            cameras[number].has_prior_focal_length = True
+    first, first_image = max(base.cameras) + 1, max(base.images) + 1
+    known = sorted(base.cameras)
+    work.cameras = [base.cameras[number] for number in known] + cameras
+    work.camera_ids = known + list(range(first, first + len(cameras)))
+    left, work.camera_of, work.image_ids = iter(camera_of), [], []
+    for item in work.photographs:
+        if item.name in number_of:
+            work.image_ids.append(number_of[item.name])
+            points = base.image(number_of[item.name]).points2D
+            work.in_model[number_of[item.name]] = np.array([point.xy for point in points]).reshape(-1, 2)
+            work.camera_of.append(known.index(base.image(number_of[item.name]).camera_id))
+        else:
+            work.image_ids.append(first_image)
+            work.camera_of.append(len(known) + next(left))
+            first_image += 1
+
+
+def _matches(base: pycolmap.Reconstruction, image_ids: Sequence[int]) -> dict[tuple[int, int], Ints]:
+    """Return the matches of pairs of images in a model, from its points: COLMAP forgets images without any."""
+    index, found = {number: row for row, number in enumerate(image_ids)}, dict[tuple[int, int], list[tuple[int, int]]]()
+    for point in base.points3D.values():
+        seen = sorted((index[one.image_id], one.point2D_idx) for one in point.track.elements)
+        for (i, a), (j, b) in combinations(seen, 2):
+            if i != j:
+                found.setdefault((i, j), []).append((a, b))
+    return {pair: np.array(matches) for pair, matches in found.items()}
+
+
+def _register(work: _Work, base: pycolmap.Reconstruction, fixed: set[int]) -> pycolmap.Reconstruction:
+    """Return the model with the new images; those of the numbers `fixed` keep their poses."""
+    for folder in ("grown", "base"):
+        shutil.rmtree(work.folder / folder, ignore_errors=True)
+        (work.folder / folder).mkdir()
+    before = {number: base.image(number).cam_from_world() for number in fixed}
+    base.write(str(work.folder / "base"))
+    options = work._incremental_options()
+    options.fix_existing_frames, options.multiple_models = True, False
+    options.constant_cameras, options.min_num_matches = set(base.cameras), 1
+    with tqdm(total=len(work) - len(fixed), desc="map", unit="image") as bar, _quiet():
+        models = pycolmap.incremental_mapping(
+            work.write_database(), work.session.path.parent, work.folder / "grown", options,
+            input_path=work.folder / "base", next_image_callback=bar.update,
+        )  # fmt: skip
+        model = max(models.values(), key=lambda one: one.num_reg_images(), default=base)
+        work._refine(model, fixed)
+    for number, pose in before.items():
+        moved = model.image(number).cam_from_world()
+        assert np.allclose(moved.matrix(), pose.matrix(), atol=1e-6), "the mapper has moved an image of the model"
+    return model
+
+
+def _append(
+    session: Path, added: list[pycolmap.Image], item_of: dict[str, Photograph], reasons: dict[str, str]
+) -> None:
+    """Add images to the files of a session; its list of images last, so that a killed command leaves a session."""
+    opened = Session.open(session)
+    first = int(opened.images["timestamp"].max()) // 10**6 + 1
+    taken = {str(name) for name in opened.sensors["sensor_id"]}
+    number, sensors = len(taken) + 1, dict[int, str]()
+    rows: dict[str, list[str]] = {"sensors.txt": [], "trajectories.txt": [], "images.txt": []}
+    table = pd.read_csv(session / "proc" / "import.csv", dtype=str, keep_default_na=False)
+    listed = [{"image": name, "status": why} for name, why in reasons.items()]
+    for step, image in enumerate(added):
+        item, time_us, camera = item_of[image.name], (first + step) * 10**6, image.camera
+        assert camera is not None
+        if image.camera_id not in sensors:
+            sensors[image.camera_id] = f"{SUBSESSION}/cam_{number}"
+            number += 1
+            rows["sensors.txt"].append(f"{sensors[image.camera_id]}, , camera, {camera_text(camera)}")
+        sensor, path = sensors[image.camera_id], f"{IMPORTED}{item.name}"
+        target = session / RAW_DATA / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.unlink(missing_ok=True)
+        if (session / LINKED_HERE).is_file():
+            target.symlink_to(item.path.absolute())
+        else:
+            shutil.copyfile(item.path, target)
+        pose = image.cam_from_world().inverse()
+        values = qt_from_pose(make_pose(pose.rotation.matrix(), pose.translation)).tolist()
+        rows["trajectories.txt"].append(", ".join([str(time_us), sensor, *map(repr, values)]))
+        rows["images.txt"].append(f"{time_us}, {sensor}, {path}")
+        listed.append({"image": item.name, "status": "imported", "path": path, "timestamp": str(time_us),
+                       "sensor_id": sensor, "device_id": sensor, "camera": camera_text(camera)})  # fmt: skip
+    for name, lines in rows.items():  # a killed command may have left poses without images
+        _rewrite(session / name, lambda cells: not cells[0].isdigit() or int(cells[0]) < first * 10**6, lines)
+    table = pd.concat([table, pd.DataFrame(listed)])
+    table.drop_duplicates("image", keep="last").to_csv(session / "proc" / "import.csv", index=False)
+
+
+def _rewrite(path: Path, keep: Callable[[list[str]], bool], added: Sequence[str] = ()) -> None:
+    """Write the lines of a table again that a function of their cells keeps, and further lines."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    kept = [line for line in lines if line.startswith("#") or keep([cell.strip() for cell in line.split(",")])]
+    write_table(path, None, [*kept, *added])
+
+
+def _finish(folder: Path, session: Path, model: pycolmap.Reconstruction) -> None:
+    model.write(str(folder / "models" / "0"))
+    record = read_json(session / RECORD)
+    table = pd.read_csv(session / "proc" / "import.csv")
+    record |= {"photographs": len(table), "registered": model.num_reg_images(), "points": model.num_points3D()}
+    write_text(session / RECORD, json.dumps(record, indent=1) + "\n")
