@@ -28,7 +28,7 @@ from toolkit.exchange.reconstruct import FOLDER, RATIO, RECORD, _hand_over, _Mut
 from toolkit.features.features import KINDS
 from toolkit.features.matching import LocalMethod
 from toolkit.features.sift import SiftExtractor
-from toolkit.files import IMPORTED, own_name, read_json, write_text
+from toolkit.files import IMPORTED, MASKS, own_name, read_json, write_text
 from toolkit.geometry import Ints, make_pose, qt_from_pose
 from toolkit.store.items import heals
 
@@ -47,7 +47,7 @@ def add_recording(
     """
     folder, session = Path(capture) / FOLDER, Path(capture) / "sessions" / f"{device}_map"
     base = _model(folder, session)
-    old = _photographs(base, folder, session.name)
+    old = _photographs(base, folder, session)
     known = {item.path.resolve() for item in old.values()}
     gathered, unreadable = gather(list(map(Path, sources)), folder / "images", fps, prefixed=True)
     new = [item for item in gathered if item.path.resolve() not in known]
@@ -109,13 +109,15 @@ def _model(folder: Path, session: Path) -> pycolmap.Reconstruction:
     return pycolmap.Reconstruction(str(path))
 
 
-def _photographs(base: pycolmap.Reconstruction, folder: Path, session_id: str) -> dict[int, Photograph]:
-    """Return the photographs of a model by the number of the image."""
+def _photographs(base: pycolmap.Reconstruction, folder: Path, session: Path) -> dict[int, Photograph]:
+    """Return the photographs of a model, with their masks, by the number of the image."""
     photographs, sessions = {}, folder / "sessions"
     for number in sorted(base.reg_image_ids()):
         name = base.image(number).name
-        path = (sessions / name).resolve()
-        photographs[number] = Photograph(own_name(name), path, read_header(path)[1], None)
+        path, mask = (sessions / name).resolve(), session / MASKS / f"{IMPORTED}{own_name(name)}.png"
+        photographs[number] = Photograph(
+            own_name(name), path, read_header(path)[1], None, mask.resolve() if mask.is_file() else None
+        )
     return photographs
 
 
@@ -206,12 +208,9 @@ def _append(
             rows["sensors.txt"].append(f"{sensors[image.camera_id]}, , camera, {camera_text(camera)}")
         sensor, path = sensors[image.camera_id], f"{IMPORTED}{item.name}"
         target = session / RAW_DATA / path
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.unlink(missing_ok=True)
-        if (session / LINKED_HERE).is_file():
-            target.symlink_to(item.path.absolute())
-        else:
-            shutil.copyfile(item.path, target)
+        _place(session, item.path, target)
+        if item.mask is not None:
+            _place(session, item.mask, session / MASKS / f"{path}.png")
         pose = image.cam_from_world().inverse()
         values = qt_from_pose(make_pose(pose.rotation.matrix(), pose.translation)).tolist()
         rows["trajectories.txt"].append(", ".join([str(time_us), sensor, *map(repr, values)]))
@@ -222,6 +221,16 @@ def _append(
         _rewrite(session / name, lambda cells: not cells[0].isdigit() or int(cells[0]) < first * 10**6, lines)
     table = pd.concat([table, pd.DataFrame(listed)])
     table.drop_duplicates("image", keep="last").to_csv(session / "proc" / "import.csv", index=False)
+
+
+def _place(session: Path, source: Path, target: Path) -> None:
+    """Link to a file or copy it, as the other files of the session were placed."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.unlink(missing_ok=True)
+    if (session / LINKED_HERE).is_file():
+        target.symlink_to(source.absolute())
+    else:
+        shutil.copyfile(source, target)
 
 
 def _rewrite(path: Path, keep: Callable[[list[str]], bool], added: Sequence[str] = ()) -> None:
