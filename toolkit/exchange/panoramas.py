@@ -56,7 +56,7 @@ def import_panoramas(
 
         def cut(name: str) -> int | str:
             try:
-                return _cut(folder / name, out / Path(name).with_suffix(""), masks and Path(masks))
+                return _cut(folder / name, out / Path(name).with_suffix(""), Path(masks) if masks else None)
             except ImageError as error:
                 return str(error)
 
