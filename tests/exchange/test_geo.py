@@ -11,6 +11,7 @@ import PIL.Image
 import pytest
 from typer.testing import CliRunner
 
+from tests.rendered import LIST, prepared
 from toolkit.__main__ import app
 from toolkit.capture import Capture
 from toolkit.errors import CaptureError, ManifestError
@@ -18,8 +19,10 @@ from toolkit.exchange.geo import export_exif, export_geo, geo_table
 from toolkit.exchange.georeference import GEO_COLUMNS, east_north_up, geographic, geographic_poses, origin_of
 from toolkit.exchange.photographs import gather
 from toolkit.geometry import Floats, make_pose
-from toolkit.scene import Run
+from toolkit.localize import localize_pairs
+from toolkit.results.pair import PairResults
 
+DEVICES = ("hl", "ios")
 ORIGIN = np.array([-33.8568, 151.2153, 5.0])
 
 
@@ -60,6 +63,19 @@ def test_north_is_that_at_the_camera() -> None:
     assert heading == pytest.approx(1.268 * np.sin(np.pi / 4), abs=0.01)
 
 
+@pytest.fixture(scope="module")
+def localized(small_capture: Path, small_features: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that has localized the phone and the headset, a rig, in the phone's map."""
+    folder = tmp_path_factory.mktemp("localized")
+    files = prepared(folder, small_capture, small_features, DEVICES)
+    folders = (files.retrieval_dir, files.poses_dir, files.features, files.maps)
+    for device in DEVICES:
+        localize_pairs(
+            small_capture / "sessions", *folders, queries=LIST, workers=1, map_device="ios", query_device=device
+        )
+    return folder
+
+
 @pytest.fixture
 def placed(small_capture: Path, tmp_path: Path) -> Path:
     """The small capture, whose map has an origin."""
@@ -71,43 +87,44 @@ def placed(small_capture: Path, tmp_path: Path) -> Path:
     return capture
 
 
-def test_tables_have_a_row_for_every_image(small_run: Path, placed: Path, tmp_path: Path) -> None:
-    table = geo_table(small_run, placed)
+def test_tables_have_a_row_for_every_image(localized: Path, placed: Path, tmp_path: Path) -> None:
+    table = geo_table(localized, placed)
     assert set(table["map_device"]) == {"ios"}
-    run = Run.open(small_run)
-    images = run.queries[run.queries["map_device"] == "ios"]["image"]
+    poses = localized / placed.name / "poses"
+    results = {device: PairResults.of(poses, placed.name, "ios", device) for device in DEVICES}
+    images = [names for result in results.values() for names in result.table["image"]]
     assert len(table) == sum(len(str(names).split(";")) for names in images)
     known = table[table["latitude_deg"].notna()]
     row = known.iloc[0]
-    result = run.result(row["image"], "ios")
     session = Capture.open(placed)[f"{row['query_device']}_query"]
-    world_from_cam = result.world_from_rig @ session.rig_from_cam([session.row_of_name[row["image"]]])[0]
+    world_from_rig = results[row["query_device"]].trajectory.lookup([row["timestamp"]], [row["device_id"]])[0]
+    world_from_cam = world_from_rig @ session.rig_from_cam([session.row_of_name[row["image"]]])[0]
     east, north, _ = world_from_cam[:3, 3]
     assert row["latitude_deg"] - ORIGIN[0] == pytest.approx(north / 110_922, rel=1e-3)  # meters per degree there
     assert row["longitude_deg"] - ORIGIN[1] == pytest.approx(east / 92_556, rel=1e-3)
     axis = world_from_cam[:3, 2]
     assert row["heading_deg"] == pytest.approx(np.degrees(np.arctan2(axis[0], axis[1])) % 360, abs=1e-3)
-    count = export_geo(small_run, tmp_path / "q.csv", placed)
+    count = export_geo(localized, tmp_path / "q.csv", placed)
     assert count == len(known)
     assert pd.read_csv(tmp_path / "q.csv")["heading_deg"].notna().sum() == count
-    assert export_geo(small_run, tmp_path / "q.geojson", placed) == count
+    assert export_geo(localized, tmp_path / "q.geojson", placed) == count
     features = json.loads((tmp_path / "q.geojson").read_text())["features"]
     assert len(features) == len(table)
     point = next(feature["geometry"] for feature in features if feature["geometry"])
     assert point["coordinates"] == pytest.approx([row["longitude_deg"], row["latitude_deg"], row["altitude_m"]])
 
 
-def test_copies_have_position_direction_and_the_same_pixels(small_run: Path, placed: Path, tmp_path: Path) -> None:
+def test_copies_have_position_direction_and_the_same_pixels(localized: Path, placed: Path, tmp_path: Path) -> None:
     sessions = placed / "sessions"
     (first, *_) = sorted((sessions / "ios_query/raw_data").rglob("*.jpg"))
     exif = PIL.Image.Exif()
     exif[0x010F], exif[0x8825] = "Maker", {1: "N", 2: (1.0, 2.0, 3.0), 17: 5.0, 29: "2026:01:02"}
     with PIL.Image.open(first) as image:
-        image.save(first, quality=97, exif=exif)
-    arguments = ["export", "exif", small_run, tmp_path / "out", "--capture", placed]
+        image.save(first, "MPO", save_all=True, append_images=[image.reduce(4)], quality=97, exif=exif)  # as phones do
+    arguments = ["export", "exif", localized, tmp_path / "out", "--capture", placed]
     result = CliRunner().invoke(app, list(map(str, arguments)))
     assert result.exit_code == 0, result.output
-    table = geo_table(small_run, placed).query("status == 'ok'").drop_duplicates("image").set_index("image")
+    table = geo_table(localized, placed).query("status == 'ok'").drop_duplicates("image").set_index("image")
     copies = {path.relative_to(tmp_path / "out").as_posix(): path for path in (tmp_path / "out").rglob("*.jpg")}
     assert set(copies) == set(table.index)
     for name, path in copies.items():
@@ -121,19 +138,34 @@ def test_copies_have_position_direction_and_the_same_pixels(small_run: Path, pla
         assert (tags[1], tags[3], tags[16]) == ("S", "E", "T")
         assert np.array_equal(cv2.imread(str(path)), cv2.imread(str(sessions / name)))
     with PIL.Image.open(tmp_path / "out" / first.relative_to(sessions)) as image:
-        assert image.getexif()[0x010F] == "Maker"
+        assert (image.format, image.n_frames, image.getexif()[0x010F]) == ("MPO", 2, "Maker")
         assert image.getexif().get_ifd(0x8825)[29] == "2026:01:02"
     with pytest.raises(ManifestError):
-        export_exif(small_run, tmp_path / "out", placed)
+        export_exif(localized, tmp_path / "out", placed)
 
 
-def test_what_is_refused(small_run: Path, placed: Path, tmp_path: Path) -> None:
+def test_what_is_refused(localized: Path, small_capture: Path, placed: Path, tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="no origin"):
-        geo_table(small_run)
+        geo_table(localized, small_capture)
     with pytest.raises(ManifestError, match="geojson"):
-        export_geo(small_run, tmp_path / "q.kml", placed)
+        export_geo(localized, tmp_path / "q.kml", placed)
     record = placed / "sessions/ios_map/proc/import.json"
     for origin in ([1, 2, 3], {"latitude_deg": 99, "longitude_deg": 1, "altitude_m": 1}, {"latitude_deg": 1}):
         record.write_text(json.dumps({"origin": origin}))
         with pytest.raises(CaptureError, match=r"import\.json: origin"):
             origin_of(Capture.open(placed)["ios_map"])
+
+
+@pytest.mark.slow
+def test_localize_tells_where_on_the_earth(
+    small_run: Path, small_capture: Path, released_weights: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = Capture.open(small_capture)["ios_query"]
+    row = session.rows_of_keyframes(session.keyframes("all"))[0][0]
+    arguments = ["localize", str(small_run), str(session.image_path(int(row))), "--json"]
+    assert "latitude_deg" not in json.loads(CliRunner().invoke(app, arguments).stdout)["photographs"][0]
+    with monkeypatch.context() as patch:
+        patch.setattr("toolkit.exchange.georeference.origin_of", lambda session: ORIGIN)
+        (found,) = json.loads(CliRunner().invoke(app, arguments).stdout)["photographs"]
+    expected = geographic_poses(np.array([found["world_from_cam"]]), ORIGIN)[0]
+    assert [found[name] for name in GEO_COLUMNS] == pytest.approx(expected.tolist())

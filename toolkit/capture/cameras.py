@@ -29,10 +29,7 @@ def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
         raise ValueError("found camera model 'EQUIRECTANGULAR': cut such images into views by `import panoramas`.")
     if model not in models:
         raise ValueError(f"found camera model {model!r}, expected one of {', '.join(models)}.")
-    default = pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1)
-    count = len(default.params)
-    if not len(default.focal_length_idxs()):  # EQUIRECTANGULAR
-        raise ValueError(f"found camera model {model!r}, which has no focal length: cut panoramas into pinhole views.")
+    count = len(pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1).params)
     try:
         # The benchmark writes `960`, other tools `960.0`. Python accepts `9_60`, which is refused here.
         numbers = np.array([float(value.replace("_", " ")) for value in values if value], np.float64)

@@ -145,7 +145,7 @@ def _write_with_gps(source: Path, target: Path, row: Mapping[Any, Any]) -> None:
     """Write a copy of a picture with other GPS tags."""
     try:
         with PIL.Image.open(source) as image:
-            exif, kind = image.getexif(), image.format
+            exif, kind, jpeg = image.getexif(), image.format, source.read_bytes()
             tags = exif.get_ifd(_GPS)
             latitude, longitude, altitude, heading = (row[name] for name in GEO_COLUMNS[:4])
             tags |= {
@@ -160,11 +160,11 @@ def _write_with_gps(source: Path, target: Path, row: Mapping[Any, Any]) -> None:
             if math.isfinite(row["position_std_m"]):
                 tags[31] = round(row["position_std_m"], 4)
             exif[_GPS] = tags
-            if kind != "JPEG":
+            if not jpeg.startswith(b"\xff\xd8"):  # of a JPEG with several pictures, Pillow says MPO
                 image.save(target, format=kind, exif=exif, icc_profile=image.info.get("icc_profile"))
                 return
         content = _EXIF_HEAD + exif.tobytes().removeprefix(_EXIF_HEAD)
-        target.write_bytes(_with_exif(source.read_bytes(), content))
+        target.write_bytes(_with_exif(jpeg, content))
     except HEADER_ERRORS as error:
         raise ImageError(f"{source}: EXIF tags cannot be written ({error}).") from None
 
@@ -179,4 +179,6 @@ def _with_exif(jpeg: bytes, exif: bytes) -> bytes:
         if not (jpeg[at + 1] == 0xE1 and jpeg[at + 4 : at + 10] == _EXIF_HEAD):
             kept += jpeg[at:end]
         at = end
+    if jpeg[at : at + 2] != b"\xff\xda":
+        raise ValueError("no start of a scan")
     return jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + bytes(kept) + jpeg[at:]

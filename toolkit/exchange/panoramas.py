@@ -56,7 +56,7 @@ def import_panoramas(
 
         def cut(name: str) -> int | str:
             try:
-                return _cut(folder / name, out / Path(name).with_suffix(""), Path(masks) if masks else None)
+                return _cut(folder / name, out / Path(name).with_suffix(""), None if masks is None else Path(masks))
             except ImageError as error:
                 return str(error)
 
