@@ -254,6 +254,7 @@ def test_a_run_killed_after_the_file_was_written_leaves_no_progress_beside_it(
     assert not list(files.reranked_dir.glob(".*"))
 
 
+@pytest.mark.slow
 def test_another_map_that_turns_the_images_makes_the_file_anew(
     small_capture: Path, files: SceneFiles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,7 +21,8 @@ from toolkit.files import sidecar_path
 from toolkit.manifest import RetrieveSettings
 
 DIM = 64
-FACTORIES = ["RaBitQ", "IVF16,Flat", "PCA32,IVF16,RaBitQ", "HNSW16", "IVF2,PQ16x4", "PCA32,Flat"]
+_SLOW = pytest.param("IVF2,PQ16x4", marks=pytest.mark.slow)  # trained for seconds
+FACTORIES = ["RaBitQ", "IVF16,Flat", "PCA32,IVF16,RaBitQ", "HNSW16", _SLOW, "PCA32,Flat"]
 
 
 @pytest.fixture(scope="module")

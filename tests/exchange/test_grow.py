@@ -23,6 +23,9 @@ from toolkit.files import read_json
 TABLES = ("images.txt", "trajectories.txt")
 
 
+pytestmark = pytest.mark.slow  # each reconstructs
+
+
 @pytest.fixture(scope="module")
 def folders(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """`first` has 4 photographs of the phone's map, `more` 2 others, `foreign` one of nothing."""

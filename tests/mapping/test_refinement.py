@@ -48,6 +48,7 @@ def test_noise_of_poses_is_removed_and_the_map_stays_where_it_was(
     assert refined.consistency.rotation_noise_deg < 0.3 * given.consistency.rotation_noise_deg
 
 
+@pytest.mark.slow
 def test_exact_poses_stay_as_they_are(small_capture: Path, small_features: Path, tmp_path: Path) -> None:
     refined = rebuilt(small_capture, small_features, tmp_path / "refined.npz", REFINE)
     given = rebuilt(small_capture, small_features, tmp_path / "given.npz", MapSettings())

@@ -56,6 +56,7 @@ def test_what_is_no_run_names_those_beside_it(tmp_path: Path) -> None:
         run.map("ios")
 
 
+@pytest.mark.slow
 def test_a_map_by_itself_localizes_as_a_run_with_queries(small_capture: Path, tmp_path: Path) -> None:
     sessions = tmp_path / "PLACE" / "sessions"
     sessions.mkdir(parents=True)
