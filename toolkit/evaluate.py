@@ -228,7 +228,8 @@ def evaluate_sequences(
             steps.append(pd.DataFrame(sequence.recalls(keys, truth, limits, unit, length)).assign(**pair))
             changed = sequence.changes(keys, truth, limits[-1], length).assign(**pair)
             single = PairResults.of(poses_dir, capture.name, map_, query).table
-            images = single[[*(key := ["timestamp", "device_id"]), "image"]]
+            # Results of earlier versions have no names of images.
+            images = single.reindex(columns=[*(key := ["timestamp", "device_id"]), "image"], fill_value="")
             changes.append(changed.merge(images, "left", on=key))
         except (CaptureError, ArtifactError) as error:
             logger.warning("%s: its sequences are not evaluated. %s", sequence.stem.name, error)
