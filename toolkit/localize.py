@@ -50,7 +50,7 @@ from toolkit.results.metrics import camera_messages
 from toolkit.results.opening import MAPS, attributes, session_fingerprint, update_attributes
 from toolkit.results.pair import query_group
 from toolkit.runs.pairs import PairRows
-from toolkit.scene.map import ROUNDS, WITHOUT_FEATURES, Map, create_methods, localize_image, needs_upright
+from toolkit.scene.map import WITHOUT_FEATURES, Map, create_methods, localize_image, needs_upright
 from toolkit.scene.stored import StoredQueries
 from toolkit.store.hdf5 import write_groups
 from toolkit.store.items import Items, heals
@@ -312,7 +312,6 @@ class _Pair:
                 "features": settings.features.model_dump(exclude={"checkpoint"}),
                 "matcher": settings.matcher.model_dump(exclude={"checkpoint"}),
                 "weights": [file_fingerprint(path) for path in weights_files(settings)],
-                "rounds": ROUNDS,
             }
         if stage.turns is not None:  # they follow from all maps of the capture, not only from that of this pair
             record["turns"] = stage.turns.fingerprint(sessions)
@@ -356,8 +355,8 @@ class _Pair:
             self._add_features(self.map.kinds, range(len(self.keys)))
         return self
 
-    def _add_features(self, kinds: Sequence[AnyMethod], numbers: Iterable[int], match: bool = True) -> None:
-        """Extract features of query images, and `match` them with their references if the matcher is a network.
+    def _add_features(self, kinds: Sequence[AnyMethod], numbers: Iterable[int]) -> None:
+        """Extract features of query images, and match them with their references if the matcher is a network.
 
         If the map has no features of a kind, also extract those of the references.
         """
@@ -379,7 +378,7 @@ class _Pair:
                 references = dict.fromkeys(name for _, name in names)
                 map_features = scene_map.on_demand(kind).prepare(references, stage.workers, stage.skip_existing)
             matches = None
-            if match and isinstance(map_features, FeatureStore) and not isinstance(kind.matcher, MutualMatcher):
+            if isinstance(map_features, FeatureStore) and not isinstance(kind.matcher, MutualMatcher):
                 sessions, stores = (session.id, f"{scene_map.device}_map"), (store, map_features)
                 matches = match_sessions(stores, names, kind.matcher, scene_map.map_dir, sessions, stage.skip_existing)
             self.stored.stores.append(store)
@@ -447,8 +446,8 @@ class _Pair:
         return QueryResult.from_arrays(items[name]).with_row(items.note(name))
 
     def add_fallback(self, todo: Sequence[_Todo]) -> None:
-        """Extract the fallback features of queries; `Map.retry` matches as many as it needs."""
-        self._add_features(self.map.escalation, [number for _, _, number in todo], match=False)
+        """Extract and match the fallback features of queries."""
+        self._add_features(self.map.escalation, [number for _, _, number in todo])
 
     def localize_into(
         self, items: Items, todo: Sequence[_Todo], retry_s: float | None = None

@@ -108,7 +108,7 @@ class References:
         """Return references from lists; without scores, all scores are 1."""
         return cls(np.array(images, np.int64), np.array(scores if scores is not None else [1.0] * len(images)))
 
-    def take(self, part: slice | NDArray[np.bool_] | Ints) -> "References":
+    def take(self, part: slice | NDArray[np.bool_]) -> "References":
         """Return a subset."""
         return References(self.images[part], self.scores[part])
 

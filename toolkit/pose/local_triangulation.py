@@ -30,9 +30,6 @@ from toolkit.pose.pnp import PnpLocalizer, PnpMatches
 from toolkit.pose.result import QueryResult
 from toolkit.threads import fixed_sums
 
-KnownMatches = dict[tuple[int, str, int], PairMatches]
-"""Matches by number of the query image, name of the reference, and number of the kind of features."""
-
 
 @dataclass(frozen=True)
 class PosedImages:
@@ -101,20 +98,8 @@ class OnDemandLocalizer(Localizer):
         self.image_names = posed.names
 
     @fixed_sums
-    def match(
-        self,
-        query: Query,
-        references: Sequence[References],
-        asked: Sequence[References] | None = None,
-        known: KnownMatches | None = None,
-    ) -> PnpMatches:
-        """Return the matches of a query, with a map that has the points of its references; see `Localizer`.
-
-        Args:
-            asked: references that features without points are matched with; None: all.
-            known: matches of such features from an earlier call with other `asked`; gets the new ones, too.
-        """
-        asked, known = references if asked is None else asked, {} if known is None else known
+    def match(self, query: Query, references: Sequence[References]) -> PnpMatches:
+        """Return the matches of a query, with a map that has the points of its references; see `Localizer`."""
         images = np.unique(np.concatenate([np.zeros(0, np.int64), *(retrieved.images for retrieved in references)]))
         names = [self.posed.names[index] for index in images]
         mapped, point_index, first_point = [], [], 0
@@ -126,17 +111,11 @@ class OnDemandLocalizer(Localizer):
             first_point += len(whole.map.points)
         stored_matches = query.network_matches or [[None] * len(self.mapped) for _ in query.views]
         matches = [list(of_camera[: len(self.mapped)]) for of_camera in stored_matches]
-        of_asked = np.unique(np.concatenate([np.zeros(0, np.int64), *(found.images for found in asked)]))
         for number, (method, source) in enumerate(self.on_demand, start=len(self.mapped)):
-            features = {self.posed.names[index]: source(self.posed.names[index]) for index in of_asked}
-            new_matches = self._match(query, asked, features, method, number, known)
-            local_map = self.triangulate(of_asked, features, new_matches, KINDS[method.name])
-            for of_image, retrieved in zip(new_matches, references, strict=True):
-                for index in retrieved.images:
-                    of_image.setdefault(self.posed.names[index], PairMatches.none())
-            nothing = next(iter(features.values())).take(slice(0)) if features else LocalFeatures.none((1, 1))
-            known_features = dict.fromkeys(names, nothing) | features
-            mapped.append(MappedFeatures(local_map, known_features, method.name, method.matcher))
+            features = {name: source(name) for name in names}
+            new_matches = self._match(query, references, features, method, number)
+            local_map = self.triangulate(images, features, new_matches, KINDS[method.name])
+            mapped.append(MappedFeatures(local_map, features, method.name, method.matcher))
             point_index.append(np.full(len(local_map.points), -1))  # these points are in no map file
             for of_camera, of_kind in zip(matches, new_matches, strict=True):
                 of_camera.append(of_kind.__getitem__)
@@ -158,7 +137,6 @@ class OnDemandLocalizer(Localizer):
         features: Mapping[str, LocalFeatures],
         method: AnyMethod,
         number: int,
-        known: KnownMatches,
     ) -> list[dict[str, PairMatches]]:
         """Return for each query image its matches with its references, by name, of the kind with the given number."""
         to_match: dict[tuple[int, str], tuple[LocalFeatures, LocalFeatures]] = {}
@@ -166,16 +144,14 @@ class OnDemandLocalizer(Localizer):
         for camera, (query_features, retrieved) in enumerate(zip(query.features, references, strict=True)):
             stored = query.network_matches[camera][number] if query.network_matches else None
             for name in (self.posed.names[index] for index in retrieved.images):
-                if (camera, name, number) in known:
-                    matches[camera][name] = known[camera, name, number]
-                elif stored is not None:  # matches with an unreadable reference are not stored
+                if stored is not None:  # matches with an unreadable reference are not stored
                     matches[camera][name] = stored(name) if len(features[name]) else PairMatches.none()
                 elif not isinstance(query_features, str):
                     to_match[camera, name] = query_features[number], features[name]
         with self._network:
             new_matches = method.matcher.match(list(to_match.values()))
         for (camera, name), pair_matches in zip(to_match, new_matches, strict=True):
-            matches[camera][name] = known[camera, name, number] = pair_matches
+            matches[camera][name] = pair_matches
         return matches
 
     def triangulate(

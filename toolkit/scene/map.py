@@ -49,7 +49,7 @@ from toolkit.pose.base import (
     RoughPose,
     View,
 )  # fmt: skip
-from toolkit.pose.local_triangulation import KnownMatches, OnDemandLocalizer, PosedImages
+from toolkit.pose.local_triangulation import OnDemandLocalizer, PosedImages
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer
 from toolkit.pose.result import CAMERA, QueryResult, Status
@@ -99,9 +99,6 @@ WORTH_DEG, WORTH_LENGTHS = 0.05, 0.005
 MAX_SURE_STD_M = 0.05
 """An `ok` pose with at most this standard deviation of the position, meters, is precise enough. Otherwise the fallback
 features are used too."""
-ROUNDS = (2, 4)
-"""Numbers of references of each image that the fallback features are matched with first, before all of them: matches of
-a network take most of the time, and a pose that is sure does not need more."""
 MAX_KNOWN = 3
 """Largest number of earlier poses of a query that the fallback features judge, too."""
 
@@ -394,13 +391,8 @@ class Map:
         known_priors = [
             Prior(pose, images, SEARCH_DEG[0], "first") for pose in known if len(images := self._images_near(pose))
         ]
-        scaled, known_matches, best = query.scaled(1 / self.length), KnownMatches(), self._best_first(references, first)
-        for count in (*ROUNDS, None):
-            asked = [retrieved.take(slice(count)) for retrieved in best]
-            matches = self.fallback.match(scaled, references, asked, known_matches)
-            result = self.solve(query, matches, None, [*priors, *known_priors], self.fallback)
-            if not self.is_unsure(result) or all(len(one.images) <= count for one in best if count is not None):
-                break
+        matches = self.match(query, references, self.fallback)
+        result = self.solve(query, matches, None, [*priors, *known_priors], self.fallback)
         result = replace(result, found_by="+".join([result.found_by, *(kind.name for kind in self.escalation)]))
         better = result.status.rank >= max(first.status.rank, 1)
         return replace(
@@ -409,17 +401,6 @@ class Map:
             first_status=first.status_text,
             first_seconds=round(first.seconds, 4),
         )
-
-    def _best_first(self, references: Sequence[References], first: QueryResult) -> list[References]:
-        """Return the references of each image, those with most inliers of an earlier result first."""
-        found, names = first.correspondences, self.localizer.image_names
-        agree = found.inlier[found.view_of]
-        inliers = dict(zip(first.references, np.bincount(found.view_reference[agree], minlength=len(first.references)),
-                           strict=True))  # fmt: skip
-        orders = ([-int(inliers.get(names[index], 0)) for index in of_image.images] for of_image in references)
-        return [
-            of_image.take(np.argsort(order, kind="stable")) for of_image, order in zip(references, orders, strict=True)
-        ]
 
     def finished(self, query: Query, result: QueryResult) -> QueryResult:
         """Return a result with the names of images and method; with low confidence if the map contradicts itself."""
@@ -524,7 +505,7 @@ class Map:
         return feed_forward if settings.method == "feed_forward" else HybridLocalizer(pnp, feed_forward)
 
     @cached_property
-    def fallback(self) -> OnDemandLocalizer | None:
+    def fallback(self) -> Localizer | None:
         """Localizer with the fallback features besides; None if there are none."""
         applies = self.escalation and self.settings.method in ("pnp", "hybrid")
         if not applies or not self.consistency.trusted:  # no features make up for a wrong map
