@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 import xxhash
 
@@ -157,6 +158,12 @@ def link_or_copy(source: str | Path, target: str | Path) -> None:
         os.link(source, target)
     except OSError:  # another disk, or one without hard links
         shutil.copy2(source, target)
+
+
+def relative_url(path: Path) -> str:
+    """Return a file as the address of a link: relative to the notebook, as JupyterLab opens only what is below its own
+    folder, and a run folder can be moved."""
+    return quote(os.path.relpath(path, Path.cwd()))
 
 
 def link_folder(source: str | Path, target: str | Path) -> None:

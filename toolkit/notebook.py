@@ -18,7 +18,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
-from urllib.parse import quote
 
 import tqdm.auto
 import tqdm.std
@@ -26,7 +25,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, NonNegativeInt, Validat
 
 from toolkit import errors
 from toolkit.errors import CaptureError, ManifestError, StageError, shortage
-from toolkit.files import SceneFiles, link_folder, older_files, read_json, write_text
+from toolkit.files import SceneFiles, link_folder, older_files, read_json, relative_url, write_text
 from toolkit.manifest import (
     OPTIONAL,
     STAGES,
@@ -235,9 +234,8 @@ def linked(table: "pd.DataFrame", sessions_root: Path) -> "Styler":
     """
 
     def link(names: str) -> str:
-        # Relative to the notebook: JupyterLab opens only what lies below its own folder.
-        files = {name: os.path.relpath(sessions_root.resolve() / name, Path.cwd()) for name in names.split(";")}
-        return " ".join(f"<a href='{quote(file)}' target='_blank'>{escape(name)}</a>" for name, file in files.items())
+        links = {name: relative_url(sessions_root.resolve() / name) for name in names.split(";")}
+        return " ".join(f"<a href='{link}' target='_blank'>{escape(name)}</a>" for name, link in links.items())
 
     table = table.drop(columns=["timestamp", "device_id"], errors="ignore")  # as the image's name tells
     # A Styler needs unique names of rows.

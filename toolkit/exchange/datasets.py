@@ -11,17 +11,16 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
 import yaml
 
-from toolkit.capture import parse_camera
 from toolkit.capture.images import stored_size
 from toolkit.errors import CaptureError, ImageError, ManifestError
-from toolkit.exchange.colmap_model import inverse, read_model
+from toolkit.exchange.colmap_model import ColmapModel, inverse, read_model
 from toolkit.exchange.drafts import Draft, ImportReport, start, write_drafts
+from toolkit.exchange.interchange import camera_at
 from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
 from toolkit.manifest import nearest
 
@@ -148,13 +147,6 @@ def _numbers(where: str, words: Sequence[str], count: int) -> Floats:
     raise CaptureError(f"{where}: found {' '.join(words)[:80]!r}, expected {count} numbers.")
 
 
-def _camera(where: object, params: str) -> pycolmap.Camera:
-    try:
-        return parse_camera("camera", params)
-    except ValueError as error:
-        raise CaptureError(f"{where}: {error}") from None
-
-
 def _matrix(path: Path) -> Floats | str:
     """Return a pose (4, 4) from a file of four lines, or why there is none: tracking was lost."""
     try:
@@ -193,7 +185,7 @@ def _first(paths: Iterable[Path], folder: Path, expected: str) -> Path:
 
 
 def _seven_scenes(folder: Path) -> tuple[Path, list[Photograph]]:
-    camera = _camera(folder, ", ".join(map(str, ("PINHOLE", 640, 480, *_SEVEN_SCENES))))
+    camera = camera_at(folder, ", ".join(map(str, ("PINHOLE", 640, 480, *_SEVEN_SCENES))))
     images = []
     for file, split in (("TrainSplit.txt", "map"), ("TestSplit.txt", "query")):
         for where, (word, *_) in _lines(folder / file):
@@ -224,7 +216,7 @@ def _twelve_scenes(folder: Path) -> tuple[Path, list[Photograph]]:
     for where, words in _lines(folder / "info.txt") if (folder / "info.txt").is_file() else ():
         if words[0] == "m_calibrationColorIntrinsic":
             fx, _, cx, _, _, fy, cy = _numbers(where, words[2:], 7)
-    camera = _camera(folder / "info.txt", f"PINHOLE, {size[0]}, {size[1]}, {fx}, {fy}, {cx}, {cy}")
+    camera = camera_at(folder / "info.txt", f"PINHOLE, {size[0]}, {size[1]}, {fx}, {fy}, {cx}, {cy}")
     # The first sequence is for tests: `sequence0 [frames=357]  [start=0 ; end=356]`.
     ranges = [words for _, words in _lines(folder / "split.txt") if words[0].startswith("sequence")]
     found = re.search(r"start\s*=\s*(\d+).*?end\s*=\s*(\d+)", " ".join(ranges[0])) if ranges else None
@@ -250,19 +242,22 @@ def _cambridge(folder: Path) -> tuple[Path, list[Photograph]]:
                 focals[Path(words[0]).with_suffix("").as_posix()] = float(words[1])
             elif len(words) == 1 and focals:
                 break  # points follow
-    usual, images, sizes = float(np.median([*focals.values()])) if focals else np.nan, [], dict[str, Any]()
+    usual, images = float(np.median([*focals.values()])) if focals else np.nan, list[Photograph]()
     for file, split in (("dataset_train.txt", "map"), ("dataset_test.txt", "query")):
         for where, (name, *words) in _lines(folder / file):
             if len(words) != 7 or not re.search(r"\.\w+$", name):
                 continue  # the header
             center, quaternion = np.split(_numbers(where, words, 7), [3])
             rotation = pose_from_qt([*quaternion / np.linalg.norm(quaternion), 0, 0, 0])[:3, :3].T
-            size = sizes[name] = _size(folder / name)
-            camera: pycolmap.Camera | str = size if isinstance(size, str) else ""
-            if not isinstance(size, str):
+            camera: pycolmap.Camera | str
+            size = _size(folder / name)
+            if isinstance(size, str):
+                camera = size
+            else:
                 focal = focals.get(Path(name).with_suffix("").as_posix(), usual)
                 focal = focal if np.isfinite(focal) else 1670.0 * max(size) / 1920  # that of the phone, as often used
-                camera = _camera(where, f"SIMPLE_PINHOLE, {size[0]}, {size[1]}, {focal}, {size[0] / 2}, {size[1] / 2}")
+                width, height = size
+                camera = camera_at(where, f"SIMPLE_PINHOLE, {width}, {height}, {focal}, {width / 2}, {height / 2}")
             images.append(Photograph(name, split, camera, make_pose(rotation, center)))
     return folder, images
 
@@ -271,23 +266,25 @@ def _aachen(folder: Path) -> tuple[Path, list[Photograph]]:
     model = read_model(_first(folder.glob("3D-models/**/images.bin"), folder, "3D-models/*/images.bin").parent)
     choices = (folder / "images_upright", folder / "images" / "images_upright")
     root = _first(filter(Path.is_dir, choices), folder, "images_upright")
-    images = []
-    for image in model.images.values():
-        camera, pose = model.cameras.get(image.camera_id, "its camera is not in the model"), image.cam_from_world
-        images.append(Photograph(image.name, "map", camera, pose if isinstance(pose, str) else inverse(pose)))
+    images = _of_model(model, "map")
     for path in sorted(folder.glob("queries/*_with_intrinsics.txt")):
         for where, (name, *words) in _lines(path):
-            images.append(Photograph(name, "query", _camera(where, ", ".join(words)), None))
+            images.append(Photograph(name, "query", camera_at(where, ", ".join(words)), None))
     return root, images
 
 
 def _eth3d(folder: Path) -> tuple[Path, list[Photograph]]:
     model = read_model(folder / "dslr_calibration_undistorted")
+    return folder / "images", _of_model(model, "")
+
+
+def _of_model(model: ColmapModel, split: str) -> list[Photograph]:
+    """Return the images of a COLMAP model."""
     images = []
     for image in model.images.values():
         camera, pose = model.cameras.get(image.camera_id, "its camera is not in the model"), image.cam_from_world
-        images.append(Photograph(image.name, "", camera, pose if isinstance(pose, str) else inverse(pose)))
-    return folder / "images", images
+        images.append(Photograph(image.name, split, camera, pose if isinstance(pose, str) else inverse(pose)))
+    return images
 
 
 def _tum(folder: Path) -> tuple[Path, list[Photograph]]:
@@ -295,7 +292,7 @@ def _tum(folder: Path) -> tuple[Path, list[Photograph]]:
     if kind is None:
         expected = f"a name with {', '.join(_TUM)}, which tells the camera"
         raise CaptureError.at(folder, folder.name, expected, "Name it as published.")
-    camera = _camera(folder, _TUM[kind])
+    camera = camera_at(folder, _TUM[kind])
     rows = np.array([_numbers(where, words, 8) for where, words in _lines(folder / "groundtruth.txt")])
     rows = rows[np.argsort(rows[:, 0])]
     poses = pose_from_qt(rows[:, [7, 4, 5, 6, 1, 2, 3]])
@@ -323,7 +320,7 @@ def _kitti(folder: Path) -> tuple[Path, list[Photograph]]:
     if isinstance(size, str):
         raise CaptureError(f"{folder / f'image_{number}'}: {size}.")
     fx, fy, cx, cy = projection[0, 0], projection[1, 1], projection[0, 2], projection[1, 2]
-    camera = _camera(folder / "calib.txt", f"PINHOLE, {size[0]}, {size[1]}, {fx}, {fy}, {cx}, {cy}")
+    camera = camera_at(folder / "calib.txt", f"PINHOLE, {size[0]}, {size[1]}, {fx}, {fy}, {cx}, {cy}")
     images = []
     for file in files:
         row = int(file.stem)
@@ -344,7 +341,7 @@ def _euroc(folder: Path) -> tuple[Path, list[Photograph]]:
     except (OSError, KeyError, TypeError, ValueError, yaml.YAMLError) as error:
         keys = "T_BS, resolution, intrinsics, distortion_coefficients"
         raise CaptureError(f"{cam0 / 'sensor.yaml'}: cannot be read ({error}). Expected {keys}.") from None
-    camera = _camera(cam0 / "sensor.yaml", ", ".join(map(str, ("OPENCV", *values))))
+    camera = camera_at(cam0 / "sensor.yaml", ", ".join(map(str, ("OPENCV", *values))))
     truth = folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
     rows = [(int(words[0]), _numbers(where, words[1:], 7)) for where, words in _lines(truth)]
     times_s = np.array([time_ns / 1e9 for time_ns, _ in rows])

@@ -180,8 +180,7 @@ class Draft:
         queries.poses = {frame: pose for frame, pose in self.poses.items() if frame in held}
         self.poses = {frame: pose for frame, pose in self.poses.items() if frame not in held}
         queries.rigs, queries.unit, queries.sources = self.rigs, self.unit, self.sources
-        queries.record, queries.match_names = self.record, self.match_names
-        queries.mask_files, queries.match_names = self.mask_files, self.match_names
+        queries.record, queries.mask_files, queries.match_names = self.record, self.mask_files, self.match_names
         return queries
 
     def source(self, name: str) -> Path:

@@ -195,7 +195,7 @@ def import_images(
         given = f"a table with the columns image, {', '.join(POSE_NAMES)}"
         raise CaptureError(f"A map needs poses: give {given}, or import a transforms.json or a COLMAP model.")
     listed_cameras = read_cameras(Path(cameras)) if cameras is not None else {}
-    shared_camera = None if camera is None else _camera(camera, "camera")
+    shared_camera = None if camera is None else camera_at("camera", camera)
     posed = rows if truth is None else _read_truth(Path(truth), rows, split)
     poses = _poses_of(posed, poses_are, axes, unit_m or 1.0)
     bad_poses = {str(row["image"]): f"line {row['line']}: {row['problem']}" for row in _bad(posed).to_dict("records")}
@@ -377,7 +377,8 @@ def _is_no_photograph(path: Path) -> bool:
     return (pixels.dtype == np.uint16 and pixels.ndim == 2) or len(np.unique(pixels[::2, ::2])) <= 2
 
 
-def _camera(params: str, where: str) -> pycolmap.Camera:
+def camera_at(where: object, params: str) -> pycolmap.Camera:
+    """Return the camera `MODEL, width, height, parameter, ...`; `where` names file and line for a CaptureError."""
     try:
         return parse_camera("camera", params)
     except ValueError as error:
@@ -394,7 +395,7 @@ def _camera_of(
     """
     if "model" in row:
         text = ", ".join([row["model"], row["width"], row["height"], *str(row["params"]).split()])
-        return _camera(text, where), "the table's"
+        return camera_at(where, text), "the table's"
     if "camera_id" in row:
         if row["camera_id"] not in by_id:
             ids = ", ".join(by_id) or "none: give cameras.txt"

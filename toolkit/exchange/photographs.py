@@ -22,12 +22,12 @@ from toolkit.capture.images import (
     read_number,
 )
 from toolkit.errors import CaptureError, ImageError
-from toolkit.exchange.drafts import IMAGE_SUFFIXES, list_images
+from toolkit.exchange.drafts import HEIC_SUFFIXES, IMAGE_SUFFIXES, heic_is_read, list_images
 from toolkit.files import write_atomic
 from toolkit.scene.query import FOCAL_PRIOR
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-OTHER_SUFFIXES = (".webp", ".tif", ".tiff", ".bmp", ".gif", ".jp2", ".heic", ".heif", ".avif")
+OTHER_SUFFIXES = (".webp", ".tif", ".tiff", ".bmp", ".gif", ".jp2", *HEIC_SUFFIXES, ".avif")
 """Formats that are converted to PNG; HEIC needs the package pillow-heif."""
 STEP = 0.06  # motion of the image between chosen frames of a video, in multiples of its width
 _SMALL = 320  # width of the frames whose motion is measured, pixels
@@ -110,17 +110,13 @@ def _converted(name: str, path: Path, made: Path) -> tuple[str, Path]:
         return name, path
     target = made / f"{name}.png"
     if not target.exists():
+        if path.suffix.lower() in HEIC_SUFFIXES and not heic_is_read():
+            raise ImageError("HEIC cannot be read: pip install pillow-heif, or convert it to JPEG")
         try:
-            if path.suffix.lower() in (".heic", ".heif"):
-                import pillow_heif
-
-                pillow_heif.register_heif_opener()
             with PIL.Image.open(path) as image:
                 pixels, exif = image.convert("RGB"), image.getexif()  # in this order: Pillow turns a TIFF upright
             with write_atomic(target) as temporary:
                 pixels.save(temporary, exif=exif)
-        except ModuleNotFoundError:
-            raise ImageError("HEIC cannot be read: pip install pillow-heif, or convert it to JPEG") from None
         except HEADER_ERRORS as error:
             raise ImageError(f"cannot be read as an image ({error})") from None
     return f"{name}.png", target

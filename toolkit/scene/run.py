@@ -1,19 +1,17 @@
 """A run in the hand: what a manifest made."""
 
-import os
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import pandas as pd
 
 from toolkit.capture import Capture, Session
 from toolkit.capture.devices import in_order
 from toolkit.errors import ArtifactError
-from toolkit.files import SceneFiles, pair_devices, read_json
+from toolkit.files import SceneFiles, pair_devices, read_json, relative_url
 from toolkit.geometry import Ints
 from toolkit.pose.base import Query
 from toolkit.pose.result import QueryResult, statuses
@@ -36,9 +34,7 @@ class Page:
         return cls(path)
 
     def _repr_html_(self) -> str:
-        # Relative to the notebook: JupyterLab opens only what lies below its own folder.
-        link = quote(os.path.relpath(self.path.resolve(), Path.cwd()))
-        return f"<a href='{link}' target='_blank'>{escape(str(self.path))}</a>"
+        return f"<a href='{relative_url(self.path.resolve())}' target='_blank'>{escape(str(self.path))}</a>"
 
 
 @dataclass(frozen=True)

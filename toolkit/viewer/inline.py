@@ -7,10 +7,10 @@ from collections.abc import Callable
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from toolkit.errors import ArtifactError
 from toolkit.figures.style import as_jpeg, zoomable
+from toolkit.files import relative_url
 from toolkit.runs.kernel import TEXT_BARS
 from toolkit.viewer.blueprint import open_command
 
@@ -54,8 +54,7 @@ def show_recording(path: str | Path, height: int = 600) -> Any:
     path = Path(path)
     if not path.is_file():
         raise ArtifactError(f"{path}: no such recording. Run the cells above with recordings = True.")
-    # Relative to the notebook, so that the run folder can be moved.
-    link = quote(os.path.relpath(path.resolve(), Path.cwd()))
+    link = relative_url(path.resolve())
     size_mb = path.stat().st_size / 1e6
     display(
         HTML(
