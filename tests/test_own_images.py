@@ -53,7 +53,7 @@ def test_other_input_is_named_and_never_gets_an_earlier_result(tmp_path: Path) -
     def again(folder: Path, **options: Any) -> str:
         return import_once(folder, place, "ios", "query", **{"table": None, "camera": camera} | options)
 
-    assert "1 of 1 images" in again(tmp_path / "a")
+    assert "used of 1 in" in again(tmp_path / "a")
     session = place / "sessions" / "ios_query"
     before = session.stat().st_mtime_ns
     assert again(tmp_path / "a") == f"{session}: imported before from the same input, kept"
@@ -87,7 +87,7 @@ def test_a_camera_given_for_others_changes_nothing(tmp_path: Path) -> None:
         place = tmp_path / f"PLACE_{number}"
         for given in (None, camera, other):
             said = import_once(tmp_path / "a", place, "ios", "query", **options, camera=given)
-            assert ("1 of 1 images" if given is None else "kept") in said
+            assert ("used of 1 in" if given is None else "kept") in said
         session = Session.open(place / "sessions" / "ios_query")
         assert session.camera(str(session.images["sensor_id"].iloc[0])).params.tolist() == [50, 32, 24]
 
@@ -98,7 +98,7 @@ def test_a_transforms_json_is_taken_as_a_table(tmp_path: Path) -> None:
     PIL.Image.new("RGB", (64, 48)).save(images / "1.jpg")
     frame = {"file_path": "1.jpg", "transform_matrix": np.diag([1, -1, -1, 1]).tolist()}
     file.write_text(json.dumps({"fl_x": 50, "frames": [frame]}))
-    for said in ("1 of 1 images", "imported before from the same input, kept"):
+    for said in ("used of 1 in", "imported before from the same input, kept"):
         assert said in import_once(images, place, "ios", "map", table=file, unit_m=None, camera="of the queries")
     session = Session.open(place / "sessions" / "ios_map")
     assert session.camera("import/cam_1").params.tolist() == [50, 50, 32, 24]

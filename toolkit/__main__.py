@@ -1,5 +1,6 @@
 """The command line: `python -m toolkit run|compare|settings|check|new|import|export|...`; `--help` lists them."""
 
+import inspect
 import json
 import os
 import re
@@ -9,7 +10,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
@@ -56,7 +57,12 @@ _AXES = "Camera axes of the poses. opencv: x right, y down, z forward; opengl: x
 Axes = Annotated[str, Option("--axes", metavar="opencv|opengl", help=_AXES)]
 _DIRECTION = "Direction of the table's poses; the last has camera centers, as NVM, Bundler and Cambridge have them."
 HoldOut = Annotated[int, Option(metavar="N", help="Every Nth image becomes a query with truth; 0: none.")]
-Unit = Annotated[float | None, Option(metavar="METERS", help="Meters per unit of the poses if known.")]
+ImportedTo = Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")]
+_SPLIT = "A map needs poses; those of queries become ground truth."
+Split = Annotated[str, Option(metavar="map|query", help=_SPLIT)]
+Unit = Annotated[float | None, Option("--unit", metavar="METERS", help="Meters per unit of the poses if known.")]
+MeterUnit = Annotated[float, Option("--unit", metavar="METERS", help="Meters per unit of the poses, e.g. 0.01.")]
+ReportJson = Annotated[bool, Option("--json", help="Print the report as JSON, as in proc/import.json.")]
 MatchNames = Annotated[
     bool, Option("--match-names", help="Take files whose names differ only in case, extension or separators.")
 ]
@@ -321,45 +327,66 @@ def demo_data(
     print(f"Capture: {capture}")
 
 
-@import_app.command("colmap")
-def import_colmap(
-    model: Annotated[Path, Argument(help="Folder with cameras, images, points3D as .bin or .txt.")],
-    images: Annotated[Path, Argument(help="Folder that the model's image names are relative to.")],
-    capture: Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
+def importer(name: str) -> Callable[[Callable[..., Any]], None]:
+    """Register an import, which returns its report, as a command that also takes the options of all imports."""
+
+    def register(command: Callable[..., Any]) -> None:
+        own, shared = inspect.signature(command, eval_str=True), inspect.signature(_shared, eval_str=True)
+        parameters = {**own.parameters, **shared.parameters}
+        del parameters["options"]
+
+        @wraps(command)
+        def run_it(as_json: bool, **given: Any) -> None:
+            report = command(**given)
+            print(report.as_json() if as_json else report.text())
+
+        run_it.__signature__ = own.replace(parameters=list(parameters.values()), return_annotation=None)  # type: ignore
+        run_it.__annotations__ = {key: one.annotation for key, one in parameters.items()}
+        import_app.command(name)(run_it)
+
+    return register
+
+
+def _shared(
     device: Device = "ios",
-    split: Annotated[str, Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
     hold_out: HoldOut = 0,
-    unit: Unit = None,
-    axes: Axes = "opencv",
     match_names: MatchNames = False,
     placing: Placing = "link",
     masks: Masks = None,
     gps: Gps = False,
     positions: Positions = None,
+    as_json: ReportJson = False,
 ) -> None:
+    """Hold the options of all imports, see `exchange.drafts.Options`."""
+
+
+@importer("colmap")
+def import_colmap(
+    model: Annotated[Path, Argument(help="Folder with cameras, images, points3D as .bin or .txt.")],
+    images: Annotated[Path, Argument(help="Folder that the model's image names are relative to.")],
+    capture: ImportedTo,
+    split: Split = "map",
+    axes: Axes = "opencv",
+    unit_m: Unit = None,
+    **options: Any,
+) -> Any:
     """Make a session from a COLMAP model: cameras, poses, rigs."""
     from toolkit.exchange import interchange
 
-    report = interchange.import_colmap(
-        model, images, capture, device, split, placing, axes, unit, hold_out, match_names, masks, gps,
-        positions,
-    )  # fmt: skip
-    print(report.text())
+    return interchange.import_colmap(model, images, capture, split=split, axes=axes, unit_m=unit_m, **options)
 
 
-@import_app.command("images")
+@importer("images")
 def import_images(
     images: Annotated[Path, Argument(help="Folder of JPEG and PNG files.")],
-    capture: Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
-    device: Device = "ios",
-    split: Annotated[str, Option(metavar="map|query", help="A map needs a table with poses.")] = "query",
+    capture: ImportedTo,
+    split: Split = "query",
     table: Annotated[Path | None, Option(help=_TABLE)] = None,
     poses_are: Annotated[
         str, Option(metavar="world_from_cam|cam_from_world|rotation_of_cam_from_world", help=_DIRECTION)
     ] = "world_from_cam",
-    hold_out: HoldOut = 0,
     axes: Axes = "opencv",
-    unit: Annotated[float, Option(metavar="METERS", help="Meters per unit of the poses, e.g. 0.01.")] = 1.0,
+    unit_m: MeterUnit = 1.0,
     truth: Annotated[Path | None, Option(help="CSV like the table, with ground-truth poses of queries.")] = None,
     camera: Annotated[
         str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all images; else guessed from EXIF.")
@@ -367,84 +394,74 @@ def import_images(
     cameras: Annotated[Path | None, Option(help="COLMAP's cameras.txt.")] = None,
     only: Annotated[list[str] | None, Option(metavar="PATTERN", help="Only such images: '*.color.png'.")] = None,
     skip: Annotated[list[str] | None, Option(metavar="PATTERN", help="No such images: 'masks/*'.")] = None,
-    match_names: MatchNames = False,
-    placing: Placing = "link",
-    masks: Masks = None,
-    gps: Gps = False,
-    positions: Positions = None,
-) -> None:
+    **options: Any,
+) -> Any:
     """Make a session from a folder of images: a map with poses, or queries."""
     from toolkit.exchange import interchange
 
-    report = interchange.import_images(
-        images, capture, device, split, table, poses_are, camera, cameras, placing, axes, unit, truth, hold_out,
-        match_names, only, skip, masks, gps, positions,
+    return interchange.import_images(
+        images, capture, split=split, table=table, poses_are=poses_are, camera=camera, cameras=cameras, truth=truth,
+        only=only, skip=skip, axes=axes, unit_m=unit_m, **options,
     )  # fmt: skip
-    print(report.text())
 
 
-@import_app.command("panoramas")
+@importer("panoramas")
 def import_panoramas(
     images: Annotated[Path, Argument(help="Folder of equirectangular JPEG and PNG files, of the whole sphere.")],
-    capture: Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
-    device: Device = "ios",
-    split: Annotated[str, Option(metavar="map|query", help="A map needs a table with poses.")] = "query",
+    capture: ImportedTo,
+    split: Split = "query",
     table: Annotated[Path | None, Option(help="CSV: image,qw,qx,qy,qz,tx,ty,tz of each panorama.")] = None,
     poses_are: Annotated[
         str, Option(metavar="world_from_cam|cam_from_world", help="Direction of the table's poses.")
     ] = "world_from_cam",
     axes: Axes = "opencv",
-    unit: Annotated[float, Option(metavar="METERS", help="Meters per unit of the poses, e.g. 0.01.")] = 1.0,
-    masks: Masks = None,
-) -> None:
+    unit_m: MeterUnit = 1.0,
+    **options: Any,
+) -> Any:
     """Make a session of 360-degree panoramas: each becomes a rig of perspective views."""
-    from toolkit.exchange.panoramas import import_panoramas
+    from toolkit.exchange import panoramas
 
-    print(import_panoramas(images, capture, device, split, table, poses_are, axes, unit, masks).text())
+    return panoramas.import_panoramas(
+        images, capture, split=split, table=table, poses_are=poses_are, axes=axes, unit_m=unit_m, **options
+    )
 
 
-@import_app.command("transforms")
+@importer("transforms")
 def import_transforms(
     transforms: Annotated[Path, Argument(help="transforms.json of nerfstudio or instant-ngp, near its images.")],
-    capture: Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")],
-    device: Device = "ios",
-    split: Annotated[str, Option(metavar="map|query", help="Poses of queries become ground truth.")] = "map",
-    hold_out: HoldOut = 0,
-    unit: Unit = None,
+    capture: ImportedTo,
+    split: Split = "map",
     axes: Axes = "opengl",
+    unit_m: Unit = None,
     undo_applied: Annotated[bool, Option("--undo-applied", help=_APPLIED)] = False,
-    match_names: MatchNames = False,
-    placing: Placing = "link",
-    masks: Masks = None,
-) -> None:
+    **options: Any,
+) -> Any:
     """Make a session from a transforms.json: cameras with distortion, poses."""
     from toolkit.exchange.transforms import import_transforms
 
-    for report in import_transforms(
-        transforms, capture, device, split, placing, axes, unit, hold_out, undo_applied, match_names, masks=masks
-    ):
-        print(report.text())
+    return import_transforms(
+        transforms, capture, split=split, undo_applied=undo_applied, axes=axes, unit_m=unit_m, **options
+    )
 
 
-@import_app.command("dataset")
+@importer("dataset")
 def import_dataset(
     kind: Annotated[str, Argument(metavar="KIND", help=_KINDS)],
     path: Annotated[Path, Argument(help="Folder of the data set as published, or of one of its scenes.")],
     capture: Annotated[Path, Argument(help="New capture folder, with a map and a query session.")],
     scene: Annotated[str | None, Option(help="Scene below PATH, e.g. chess.")] = None,
-    device: Device = "ios",
     every: Annotated[int, Option(min=1, metavar="N", help="Take every Nth image of each folder.")] = 1,
-    hold_out: Annotated[int, Option(min=2, metavar="N", help="Every Nth image is a query, without a split.")] = 8,
-    placing: Placing = "link",
-) -> None:
+    **options: Any,
+) -> Any:
     """Make a map and queries from a data set of the field, and a manifest with its thresholds."""
     from toolkit.exchange.datasets import LAYOUTS, import_dataset
     from toolkit.exchange.new_manifest import new_manifest
 
-    for report in import_dataset(kind, path, capture, scene, device, every, hold_out, placing):
-        print(report.text())
+    report = import_dataset(kind, path, capture, scene, every=every, **options)
     name = re.sub(r"[^A-Za-z0-9._-]", "-", capture.resolve().name)
-    print(f"Run it: python -m toolkit run {new_manifest(name, capture, thresholds=LAYOUTS[kind].thresholds)}")
+    manifest = new_manifest(name, capture, thresholds=LAYOUTS[kind].thresholds)
+    print(f"Run it: python -m toolkit run {manifest}", file=sys.stderr)
+    return report
 
 
 @app.command()
@@ -493,9 +510,10 @@ def reconstruct(
         print("\n".join(add_recording(photos, capture, device, fps)))
     else:
         result = reconstruct(
-            photos, capture, device, hold_out, fps, camera, distance, positions, mapper, placing, masks
-        )
-        print(result.text())
+            photos, capture, device, fps, camera, distance, mapper, hold_out=hold_out, positions=positions,
+            placing=placing, masks=masks,
+        )  # fmt: skip
+        print(result.report.text())
         points, option = {"points": result.points, "colors": result.colors}, result.camera
     picture = capture / FOLDER / "cameras.png"
     draw_top_view(Capture.open(capture), **points).savefig(picture)

@@ -307,7 +307,7 @@ def test_a_model_is_aligned_to_known_places(by: str, tmp_path: Path) -> None:
         expected[:, :3, 3] += (found - expected)[:, :3, 3].mean(axis=0)
     np.testing.assert_allclose(found, expected, rtol=0, atol=0.02 if by == "gps" else 1e-5)
     with pytest.raises(ManifestError, match="unit"):
-        import_colmap(folder, tmp_path / "photos", tmp_path / "OTHER", unit_m=1.0, **options)
+        import_colmap(folder, tmp_path / "photos", tmp_path / "OTHER", unit_m=0.5, **options)
 
 
 def test_a_model_without_gps_says_so(tmp_path: Path, photos: Path) -> None:

@@ -194,24 +194,28 @@ def test_a_data_set_becomes_a_capture_with_its_poses_and_thresholds(
 
 def test_images_without_a_pose_are_rows(tmp_path: Path) -> None:
     seven_scenes(tmp_path / "7")
-    _, queries = import_dataset("7scenes", tmp_path / "7", tmp_path / "A", "chess")
+    queries = import_dataset("7scenes", tmp_path / "7", tmp_path / "A", "chess").held_out
+    assert queries is not None
     status = queries.images.set_index("image")["status"]
     assert status["seq-03/frame-000001.color.png"] == "frame-000001.pose.txt: no pose in it"
     tum(tmp_path / "tum")
-    reports = import_dataset("tum", tmp_path / "tum", tmp_path / "B", "rgbd_dataset_freiburg1_xyz", hold_out=2)
-    assert [list(report.images["status"]) for report in reports] == [
+    report = import_dataset("tum", tmp_path / "tum", tmp_path / "B", "rgbd_dataset_freiburg1_xyz", hold_out=2)
+    assert report.held_out is not None
+    assert [list(one.images["status"]) for one in (report, report.held_out)] == [
         ["imported", "imported"], ["no true pose within 0.02 s", "imported"],
     ]  # fmt: skip
-    assert "timestamps: as given" in reports[0].text()
-    assert reports[0].images["timestamp"].dropna().tolist() == [1305031102175304, 1305031102241971]
+    assert report.record["timestamps"] == [2, "as given"]
+    assert report.images["timestamp"].dropna().tolist() == [1305031102175304, 1305031102241971]
 
 
 def test_only_every_such_image_is_taken(tmp_path: Path) -> None:
     seven_scenes(tmp_path / "7")
-    reports = import_dataset("7scenes", tmp_path / "7", tmp_path / "A", "chess", every=2)
-    assert [list(report.images["image"]) for report in reports] == [
+    report = import_dataset("7scenes", tmp_path / "7", tmp_path / "A", "chess", every=2)
+    assert report.held_out is not None
+    assert [list(one.images["image"]) for one in (report, report.held_out)] == [
         ["seq-01/frame-000000.color.png"], ["seq-03/frame-000000.color.png"],
     ]  # fmt: skip
+    assert [(one["count"], one["reason"]) for one in report.record["left out"]] == [(2, "not taken by --every")]
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:

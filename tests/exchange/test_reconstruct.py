@@ -118,9 +118,9 @@ def test_two_places_are_two_models(photographs: Path, tmp_path: Path) -> None:
     (other / "000.png").unlink()
     (other / "001.png").unlink()
     result = reconstruct([photographs, other], tmp_path / "PLACE")
-    assert result.record["registered"] == 6
-    assert result.record["other models"] == [4]
-    left = result.reports[0].images.set_index("image")["status"]
+    record = read_json(tmp_path / "PLACE/sessions/ios_map" / module.RECORD)
+    assert (record["registered"], record["other models"]) == (6, [4])
+    left = result.report.images.set_index("image")["status"]
     assert "in model 1, of 4 photographs" in left["other/002.png"]
 
 

@@ -99,13 +99,13 @@ def test_points_are_seen_where_the_file_says(tmp_path: Path, intrinsics: dict[st
 
 def test_the_axes_may_be_those_of_opencv_and_the_unit_not_the_meter(tmp_path: Path) -> None:
     file = write(tmp_path)
-    report = import_transforms(file, tmp_path / "A")[0]
-    assert "unit of the poses: not known" in report.text()
-    assert json.loads((report.session / "proc" / "import.json").read_text()) == {"unit": None}
+    report = import_transforms(file, tmp_path / "A")
+    assert "unknown: relative to the depth of the scene" in report.text()
+    assert json.loads((report.session / "proc" / "import.json").read_text())["unit"] is None
     opengl = Session.open(report.session).world_from_cam()
     np.testing.assert_allclose(opengl[1], np.array(matrix(1)) @ np.diag([1, -1, -1, 1]), rtol=0, atol=1e-12)
     opencv = imported(file, tmp_path / "B", axes="opencv", unit_m=0.01)
-    assert json.loads((opencv.path / "proc" / "import.json").read_text()) == {"unit": "m"}
+    assert json.loads((opencv.path / "proc" / "import.json").read_text())["unit"] == "m"
     np.testing.assert_allclose(opencv.world_from_cam()[1][:3, :3], np.array(matrix(1))[:3, :3], rtol=0, atol=1e-12)
     np.testing.assert_allclose(opencv.world_from_cam()[:, :3, 3], opengl[:, :3, 3] / 100, rtol=0, atol=1e-12)
     for options in ({"axes": "arkit"}, {"unit_m": 0.0}, {"split": "train"}, {"hold_out": 1}, {"hold_out": 4}):
@@ -146,7 +146,8 @@ def test_every_so_many_frames_become_queries_with_their_truth(tmp_path: Path) ->
     command = ["import", "transforms", str(file), str(tmp_path / "PLACE"), "--hold-out", "3", "--unit", "2"]
     done = CliRunner().invoke(app, command)
     assert done.exit_code == 0, done.output
-    assert "5 of 5 images, 1 cameras\n1 images beside these are not in transforms.json" in done.output
+    assert "5  used of 6 in" in done.output
+    assert "1  not in transforms.json (other.jpg)" in done.output
     place = Capture.open(tmp_path / "PLACE")
     queries = place["ios_query"]
     assert [Path(path).name for path in queries.images["path"]] == ["02.jpg", "05.jpg"]
@@ -164,7 +165,9 @@ def test_a_map_without_any_query_left_is_not_written(tmp_path: Path) -> None:
         import_transforms(file, tmp_path / "PLACE", hold_out=3)
     assert not (tmp_path / "PLACE").exists()
     (tmp_path / "images" / "two.jpg").rename(tmp_path / "images" / "2.jpg")
-    assert [len(report.images) for report in import_transforms(file, tmp_path / "PLACE", hold_out=3)] == [2, 1]
+    report = import_transforms(file, tmp_path / "PLACE", hold_out=3)
+    assert report.held_out is not None
+    assert (len(report.images), len(report.held_out.images)) == (2, 1)
 
 
 def test_images_that_cannot_be_used_are_rows(tmp_path: Path) -> None:
@@ -176,7 +179,7 @@ def test_images_that_cannot_be_used_are_rows(tmp_path: Path) -> None:
     PIL.Image.new("RGB", SIZE).save(tmp_path.parent / "outside.jpg")
     long = {"file_path": "x" * 300, "transform_matrix": matrix(5)}
     file.write_text(json.dumps(content | {"frames": [*content["frames"], outside, long]}))
-    status = import_transforms(file, tmp_path / "PLACE")[0].images.set_index("image")["status"]
+    status = import_transforms(file, tmp_path / "PLACE").images.set_index("image")["status"]
     assert status["images/0.jpg"] == "imported"
     assert status["images/1.jpg"] == status["x" * 300] == "no such file"
     assert status["images/2.jpg"] == "the image is stored as 64 x 48 pixels, its camera has 65 x 48"
@@ -206,8 +209,8 @@ def test_the_folder_of_images_may_be_a_link(tmp_path: Path) -> None:
     (tmp_path / "here" / "images").symlink_to(disk)
     (disk / "circle").symlink_to(tmp_path / "here")
     (tmp_path / "here" / "again").symlink_to(disk)
-    (report,) = import_transforms(file, tmp_path / "PLACE")
-    assert report.text().splitlines()[1] == "1 images beside these are not in transforms.json"
+    report = import_transforms(file, tmp_path / "PLACE")
+    assert [(one["count"], one["first"]) for one in report.record["left out"]] == [(1, "images/other.jpg")]
     assert not check_capture(tmp_path / "PLACE").problems
     assert len(list_images(tmp_path / "here")) == 4
 
@@ -246,7 +249,7 @@ def test_what_is_malformed_is_named_with_frame_and_key(tmp_path: Path, change: d
         assert str(error.value).startswith(f"{file}, frame 1")
         assert not (tmp_path / "PLACE").exists()
         return
-    status = import_transforms(file, tmp_path / "PLACE")[0].images.set_index("image")["status"]
+    status = import_transforms(file, tmp_path / "PLACE").images.set_index("image")["status"]
     assert status["images/1.jpg"].startswith(f"{file}, frame 1")
     assert message in status["images/1.jpg"]
     assert sorted(status.index[status == "imported"]) == ["images/0.jpg", "images/2.jpg"], "the others go on"
@@ -262,13 +265,15 @@ def test_a_file_of_another_encoding_is_read(encoding: str, tmp_path: Path) -> No
 def test_the_splits_of_the_file_are_map_and_queries(tmp_path: Path) -> None:
     names = [f"images/{k}.jpg" for k in range(3)]
     split = {"train_filenames": names[:1], "test_filenames": names[1:2]}
-    reports = import_transforms(write(tmp_path, **split), tmp_path / "PLACE")
-    assert [report.session.name for report in reports] == ["ios_map", "ios_query"]
+    report = import_transforms(write(tmp_path, **split), tmp_path / "PLACE")
+    assert list(report.records()) == ["ios_map", "ios_query"]
+    assert report.held_out is not None
+    reports = report, report.held_out
     statuses = [dict(zip(report.images["image"], report.images["status"], strict=True)) for report in reports]
     assert statuses[1] == {"images/1.jpg": "imported"}
     assert statuses[0]["images/0.jpg"] == "imported"
     assert "in none of train_filenames" in statuses[0]["images/2.jpg"]
-    (queries,) = import_transforms(tmp_path / "transforms.json", tmp_path / "OTHER", split="query")
+    queries = import_transforms(tmp_path / "transforms.json", tmp_path / "OTHER", split="query")
     assert (queries.images["status"] == "imported").all()
 
 
@@ -279,7 +284,7 @@ def test_the_world_of_the_input_is_restored(tmp_path: Path) -> None:
         pose[:3, 3] *= 0.25
     frames = [{"file_path": f"images/{k}.jpg", "transform_matrix": pose.tolist()} for k, pose in enumerate(given)]
     file = write(tmp_path, frames, applied_transform=turn[:3].tolist(), applied_scale=0.25)
-    (said,) = import_transforms(file, tmp_path / "SAID")
+    said = import_transforms(file, tmp_path / "SAID")
     assert any("applied_scale 0.25" in note and "--undo-applied" in note for note in said.notes)
     session = imported(file, tmp_path / "PLACE", undo_applied=True, unit_m=1.0)
     for k, found in enumerate(session.world_from_cam()):
@@ -297,7 +302,7 @@ def test_absolute_paths_of_another_machine_are_found_by_their_ends(root: str, tm
         path = root + frame["file_path"]
         frame["file_path"] = path.replace("/", "\\") if "\\" in root else path
     file.write_text(json.dumps(content))
-    (report,) = import_transforms(file, tmp_path / "PLACE")
+    report = import_transforms(file, tmp_path / "PLACE")
     assert list(report.images["image"]) == [f"images/{k}.jpg" for k in range(3)]
     assert any(note.startswith("3 images have paths of another machine") for note in report.notes)
 

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 import pycolmap
@@ -19,7 +20,8 @@ import yaml
 from toolkit.capture.images import stored_size
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.colmap_model import ColmapModel, inverse, read_model
-from toolkit.exchange.drafts import Draft, ImportReport, start, write_drafts
+from toolkit.exchange.drafts import Options, every_nth, start
+from toolkit.exchange.import_report import ImportReport
 from toolkit.exchange.interchange import camera_at
 from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
 from toolkit.manifest import nearest
@@ -67,20 +69,17 @@ class Layout:
 
 def import_dataset(
     kind: str, path: str | Path, capture: str | Path, scene: str | None = None, device: str = "ios",
-    every: int = 1, hold_out: int = HOLD_OUT, placing: str = "link",
-) -> list[ImportReport]:  # fmt: skip
+    every: int = 1, **options: Unpack[Options],
+) -> ImportReport:  # fmt: skip
     """Make a map and a query session from a data set of the field.
 
     Args:
         kind: one of `LAYOUTS`.
         path: folder of the data set, or of one of its scenes.
-        capture, device, placing: as for `interchange.import_colmap`.
+        capture, device: as for `interchange.import_colmap`.
         scene: folder of the scene in `path`, such as `chess`; None: `path` is the scene.
         every: take only every such image of each folder.
-        hold_out: in data sets without a split, every such image becomes a query.
-
-    Returns:
-        The reports of the map and of the queries.
+        options: see `drafts.Options`; in data sets without a split, `hold_out` is `HOLD_OUT` by default.
 
     Raises:
         ManifestError: an unknown kind, scene, device or placing.
@@ -89,8 +88,8 @@ def import_dataset(
     """
     if kind not in LAYOUTS:
         raise ManifestError(f"dataset: unknown {kind!r}. {nearest(kind, LAYOUTS)}")
-    if every < 1 or hold_out < 2:
-        raise ManifestError(f"every, hold-out: found {every}, {hold_out}, expected at least 1 and 2.")
+    if every < 1:
+        raise ManifestError(f"every: found {every}, expected at least 1.")
     layout, folder = LAYOUTS[kind], Path(path) / (scene or "")
     if not any(folder.glob(layout.example)):
         scenes = sorted({match.parents[layout.example.count("/")] for match in Path(path).rglob(layout.example)})
@@ -99,28 +98,21 @@ def import_dataset(
         do = f"Give --scene: {nearest(scene or '', known)}" if known else "Give the unpacked folder of the data set."
         raise CaptureError.at(folder, found, "a scene in the layout in which it is published", do)
     root, images = layout.read(folder)
-    drafts = {split: start(capture, device, split, root, placing) for split in ("map", "query")}
-    numbers, taken = Counter[str](), 0
+    options["unit_m"], options["hold_out"] = 1.0, options.get("hold_out") or HOLD_OUT
+    draft = start(capture, device, "map", root, **options)
+    numbers, taken = Counter[str](), list[Photograph]()
     for image in sorted(images, key=lambda image: image.name):
         number = numbers[parent := str(Path(image.name).parent)]
         numbers[parent] += 1
         if number % every:
+            draft.others.setdefault("not taken by --every", []).append(image.name)
             continue
-        taken += 1
-        split = image.split or ("query" if taken % hold_out == 0 else "map")
-        _add(drafts[split], image)
-    if not drafts["query"].images and not drafts["query"].rows:
-        del drafts["query"]
-    return write_drafts(*drafts.values())
-
-
-def _add(draft: Draft, image: Photograph) -> None:
-    problem = next((why for why in (image.camera, image.pose) if isinstance(why, str)), None)
-    if problem is not None or isinstance(image.camera, str):
-        draft.rows.append({"image": image.name, "status": problem})
-        return
-    assert not isinstance(image.pose, str)
-    draft.add(image.name, image.camera, image.pose, image.time_us)
+        taken.append(image)
+        draft.add(image.name, image.camera, image.pose, f"given by {kind}", image.time_us)
+    draft.convention = f"as published by {kind}"
+    without_split = not any(image.split for image in taken)
+    held = every_nth([image.name for image in taken], draft.hold_out) if without_split else set()
+    return draft.finish(held | {image.name for image in taken if image.split == "query"})
 
 
 # Reading

@@ -1,20 +1,22 @@
 """Assemble a session from a user's own images. All imports share this module.
 
 Images are linked or copied to `raw_data/import/images/` under their names. `proc/import.csv` has a row with the status
-of each image; `proc/import.json` has the unit of the poses: `m`, or null if unknown. Images are not rotated: intrinsics
-belong to the stored pixels, whatever orientation EXIF states.
+of each image; `proc/import.json` has the table of the import (see `import_report`) and the unit of the poses: `m`, or
+null if unknown. Images are not rotated: intrinsics belong to the stored pixels, whatever orientation EXIF states.
 """
 
 import json
 import os
 import re
 import shutil
+import time
 import unicodedata
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 import pandas as pd
@@ -37,19 +39,24 @@ from toolkit.capture.images import (
     zone_of,
 )
 from toolkit.capture.names import EXPECTED_NAME, has_long_part, is_bad_name, note_linked_here
+from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import CaptureError, ImageError, ManifestError
+from toolkit.exchange.georeference import alignment, gps_position, quarter_turns, read_positions
+from toolkit.exchange.import_report import ImportReport, cameras_of, grouped
 from toolkit.files import IMPORTED, MASKS, write_folder
 from toolkit.geometry import Floats, make_pose
 from toolkit.manifest import nearest
 
 SUBSESSION = "import"
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
-DECODED_SUFFIXES = (".webp", ".tif", ".tiff", ".bmp", ".jp2")
-"""Other formats that are read."""
-READ_SUFFIXES = (*IMAGE_SUFFIXES, *DECODED_SUFFIXES)
+READ_SUFFIXES = (*IMAGE_SUFFIXES, ".webp", ".tif", ".tiff", ".bmp", ".jp2")
+"""Formats that the toolkit reads."""
 HEIC_SUFFIXES = (".heic", ".heif")
-PHOTOGRAPHS = (*IMAGE_SUFFIXES, *DECODED_SUFFIXES, *HEIC_SUFFIXES, ".gif", ".avif", ".dng", ".cr2", ".nef", ".arw")
+CONVERTED_SUFFIXES = (*READ_SUFFIXES[len(IMAGE_SUFFIXES) :], *HEIC_SUFFIXES, ".gif", ".avif")
+"""Formats that a reconstruction converts to PNG; HEIC needs the package pillow-heif."""
+PHOTOGRAPHS = (*IMAGE_SUFFIXES, *CONVERTED_SUFFIXES, ".dng", ".cr2", ".nef", ".arw")
 """Formats of photographs, read or not."""
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 CONVERT = "convert them to JPEG or PNG"
 _HOW = dict.fromkeys(HEIC_SUFFIXES, f"pip install 'visual-localization[heic]', or {CONVERT}")
 PLACING = ("link", "copy")
@@ -59,28 +66,32 @@ NOT_INSIDE = "not a path inside the folder of images"
 AXES = {"opencv": np.eye(4), "opengl": np.diag([1.0, -1.0, -1.0, 1.0])}
 """named_from_cam (4, 4) for each named convention of camera axes: `opencv`, the toolkit's own, has x right, y down, z
 forward; `opengl` has x right, y up, z backward."""
+_AXES = {"opencv": "camera x right, y down, z forward", "opengl": "camera x right, y up, z backward"}
+_MOST_FOR_UP = 300  # cameras that tell what is up
 
 
-@dataclass
-class ImportReport:
-    """The result of an import."""
+class Options(TypedDict, total=False):
+    """What all imports take, besides their own input; the defaults are those of `Draft`."""
 
-    session: Path
-    images: pd.DataFrame  # image, status (`imported` or why not), path, timestamp, sensor_id, device_id, camera
-    notes: list[str] = field(default_factory=list)  # guesses, made-up values, and anything the user should look at
-    held_out: "ImportReport | None" = None  # the queries that were made of a part of the images
-
-    def text(self) -> str:
-        """Return the report as text."""
-        imported = self.images["status"] == "imported"
-        cameras = self.images[imported]["sensor_id"].nunique()
-        lines = [f"{self.session}: {imported.sum()} of {len(self.images)} images, {cameras} cameras", *self.notes]
-        left_out = self.images[~imported]
-        lines += [f"left out: {row.image}: {row.status}" for row in left_out.head(10).itertuples()]
-        if len(left_out) > 10:
-            lines.append(f"... and {len(left_out) - 10} more, see proc/import.csv")
-        lines += [self.held_out.text()] if self.held_out is not None else []
-        return "\n".join(lines)
+    placing: str
+    """`link` to the images, or `copy` them."""
+    axes: str
+    """Camera axes of the poses, see `AXES`."""
+    unit_m: float | None
+    """Meters per unit of the poses; None: unknown, as after structure from motion. The poses are then not scaled, and
+    the session records that their unit is unknown."""
+    hold_out: int
+    """Every `hold_out`-th frame of a map, in order of names, becomes a query with ground truth instead; 0: none."""
+    match_names: bool
+    """Take files whose names differ only in case, extension or separators."""
+    masks: str | Path | None
+    """Folder of masks, see `images.find_mask`; they are placed as the images are."""
+    gps: bool
+    """Move the world to x east, y north, z up, in meters, by the GPS in EXIF of at least three images."""
+    positions: str | Path | None
+    """The same by a CSV file with the columns image, x, y, z: camera centers, meters."""
+    record: dict[str, Any]
+    """Further content of `proc/import.json`."""
 
 
 @dataclass
@@ -92,6 +103,7 @@ class DraftImage:
     sensor: str
     frame: str  # images with the same frame were taken at the same time
     rig: str | None = None
+    origin: str = ""  # where its intrinsics are from
     time_us: int | None = None
     zone_us: int | None = None  # offset of the camera's clock from UTC
     turned: bool = False  # whether the EXIF orientation says to rotate the image
@@ -112,75 +124,154 @@ class Draft:
 
     session: Path
     folder: Path  # folder of the images
-    placing: str
+    placing: str = "link"
+    axes: str = "opencv"
+    unit_m: float | None = None
+    hold_out: int = 0
+    match_names: bool = False
+    masks: str | Path | None = None
+    gps: bool = False
+    positions: str | Path | None = None
+    record: dict[str, Any] = field(default_factory=dict)
     images: list[DraftImage] = field(default_factory=list)
     rows: list[dict[str, Any]] = field(default_factory=list)  # rows of `proc/import.csv`
     poses: dict[str, Floats] = field(default_factory=dict)  # world_from_device (4, 4) by frame; queries may have none
     rigs: list[tuple[str, str, Floats]] = field(default_factory=list)  # rig, sensor, rig_from_sensor (4, 4)
-    unit: str | None = "m"  # unit of the poses; None: unknown
+    convention: str = "world_from_cam"  # of the poses as they were given
+    unit_hint: str = "If you know it, give --unit METERS (1 if a phone's tracking or a scanner gave the poses)"
+    listed_in: str = ""  # what names the images; those of the folder that it does not name are counted; empty: none
+    beside: bool = False  # count only those in the same folders
+    others: dict[str, list[str]] = field(default_factory=dict)  # files that are no row, by the reason
     notes: list[str] = field(default_factory=list)
     sources: dict[str, Path] = field(default_factory=dict)  # files that are not in `folder` under their names
-    given_times: int = 0  # images whose time is not from EXIF
-    masks: Path | None = None  # folder of masks as COLMAP names them; None: see `images.find_mask`
     mask_files: dict[str, Path] = field(default_factory=dict)  # those that are not in `masks` under their names
-    record: dict[str, Any] = field(default_factory=dict)  # further content of `proc/import.json`
-    match_names: bool = False  # take files whose names differ only in case, extension or separators
+    given_times: int = 0  # images whose time is not from EXIF
+    times_from: str = ""
     sensors: dict[str, str] = field(default_factory=dict)  # id by `camera_text`, for images that are not in a rig
+    started: float = field(default_factory=time.perf_counter)
 
     def add(
-        self, name: str, camera: pycolmap.Camera, world_from_cam: Floats | None, time_us: int | None = None
-    ) -> None:
+        self, name: str, camera: pycolmap.Camera | str, world_from_cam: Floats | str | None, origin: str,
+        time_us: int | None = None,
+    ) -> None:  # fmt: skip
         """Add an image that is not in a rig. Images with equal intrinsics share a camera.
 
         Args:
+            camera, world_from_cam: each may be why there is none, and the image is left out.
+            origin: where its intrinsics are from.
             time_us: when it was taken, microseconds; None: from EXIF.
         """
+        if isinstance(camera, str) or isinstance(world_from_cam, str):
+            self.rows.append({"image": name, "status": camera if isinstance(camera, str) else world_from_cam})
+            return
         sensor = self.sensors.setdefault(camera_text(camera), f"{SUBSESSION}/cam_{len(self.sensors) + 1}")
-        self.images.append(DraftImage(name, camera, sensor, name, time_us=time_us))
+        self.images.append(DraftImage(name, camera, sensor, name, origin=origin, time_us=time_us))
         if world_from_cam is not None:
             self.poses[name] = world_from_cam
 
-    def convert(self, axes: str, unit_m: float | None) -> None:
-        """Change poses from camera axes of `AXES` and a unit of `unit_m` meters; None: unknown, which is noted."""
-        if axes != "opencv" or unit_m not in (None, 1):
-            turn = AXES[axes]
-            self.poses = {frame: posed_camera(pose, axes, unit_m or 1.0) for frame, pose in self.poses.items()}
-            self.rigs = [
-                (rig, sensor, posed_camera(turn @ pose, axes, unit_m or 1.0)) for rig, sensor, pose in self.rigs
-            ]
-        self.note_unit(unit_m)
+    def finish(self, held: Collection[str] | None = None) -> ImportReport:
+        """Write the session without the images that cannot be used, and the queries that are held out of it.
 
-    def note_unit(self, unit_m: float | None) -> None:
-        """Record and note that the unit of the poses is not known, if `unit_m` is None."""
-        if unit_m is None:
-            self.unit = None
-            self.notes.append(
-                "unit of the poses: not known. If you know its length in meters, give --unit METERS (1 if a phone's "
-                "tracking or a scanner gave the poses). Lengths are otherwise relative to the depth of the scene"
-            )
-
-    def hold_out(self, number: int) -> "Draft | None":
-        """Move every `number`-th frame, in order of names, to the draft of a query session; None if `number` is 0.
+        Args:
+            held: the frames, or images without rigs, that become queries; None: every `hold_out`-th.
 
         Raises:
-            CaptureError: the query session exists.
-            ManifestError: a number that is not 0 or between 2 and the number of frames.
+            CaptureError: a session has no image left, or exists; none is written.
+            ManifestError: `hold_out` is not 0 or between 2 and the number of frames.
         """
-        require_hold_out(number, self.session.name.rpartition("_")[2], len({image.frame for image in self.images}))
-        if not number:
-            return None
-        queries = start(
-            self.session.parents[1], self.session.name.removesuffix("_map"), "query", self.folder, self.placing,
-            self.masks,
-        )  # fmt: skip
-        frames = list(dict.fromkeys(image.frame for image in sorted(self.images, key=lambda image: image.name)))
-        held = set(frames[number - 1 :: number])
-        queries.images = [image for image in self.images if image.frame in held]
-        self.images = [image for image in self.images if image.frame not in held]
-        queries.poses = {frame: pose for frame, pose in self.poses.items() if frame in held}
-        self.poses = {frame: pose for frame, pose in self.poses.items() if frame not in held}
-        queries.rigs, queries.unit, queries.sources = self.rigs, self.unit, self.sources
-        queries.record, queries.mask_files, queries.match_names = self.record, self.mask_files, self.match_names
+        self._place_world()
+        if held is None:
+            frames = [image.frame for image in sorted(self.images, key=lambda image: image.name)]
+            held = every_nth(list(dict.fromkeys(frames)), self.hold_out)
+        listed = {_composed(name) for name in self._names()}
+        drafts = [self, self._split(held)] if held else [self]
+        for draft in drafts:
+            draft.leave_out()
+        if self.listed_in:
+            listed |= {_composed(name) for draft in drafts for name in draft._names()}
+            self.others[f"not in {self.listed_in}"] = self._others_than(listed)
+        report, *queries = [draft.write() for draft in drafts]
+        report.held_out = queries[0] if queries else None
+        return report
+
+    def _others_than(self, listed: Collection[str]) -> list[str]:
+        """Return the images that are in the folder, and not listed: with `beside`, only in folders of listed ones."""
+        names = list[str]()
+        if self.beside:
+            folders = {PurePosixPath(name).parent for name in listed}
+            files = (file for folder in sorted(folders) for file in (self.folder / folder).glob("*"))
+            files = (file for file in files if file.suffix.lower() in IMAGE_SUFFIXES)
+            names = [file.relative_to(self.folder).as_posix() for file in files]
+        else:
+            with suppress(CaptureError):  # there may be none
+                names = list_images(self.folder)
+        return [name for name in names if _composed(name) not in listed]
+
+    def _names(self) -> list[str]:
+        return [*(image.name for image in self.images), *(str(row["image"]) for row in self.rows)]
+
+    def _place_world(self) -> None:
+        """Convert poses to the toolkit's axes and meters, by the given unit, GPS in EXIF or known camera centers."""
+        is_aligned = self.gps or self.positions is not None
+        if is_aligned and self.unit_m not in (None, 1):
+            raise ManifestError(f"unit: found {self.unit_m:g} together with GPS or positions, which tell the unit.")
+        scale = 1.0 if self.unit_m is None else self.unit_m
+        if self.axes != "opencv" or scale != 1:
+            turn = AXES[self.axes]
+            self.poses = {frame: posed_camera(pose, self.axes, scale) for frame, pose in self.poses.items()}
+            self.rigs = [(rig, sensor, posed_camera(turn @ pose, self.axes, scale)) for rig, sensor, pose in self.rigs]
+        if self.unit_m is not None and not is_aligned:
+            self.record = {"meters": f"poses in units of {self.unit_m:g} m"} | self.record
+        self.record["unit"] = "m" if not self.poses or "meters" in self.record else None
+        if is_aligned and self.poses:
+            self._align()
+
+    def _align(self) -> None:
+        """Move the poses to the world of known camera centers, or of GPS in EXIF: z is up, in meters.
+
+        If they do not tell it, the poses stay, and their unit is unknown.
+        """
+        posed = [image for image in self.images if image.frame in self.poses and is_file(self.source(image.name))]
+        poses = self._camera_poses(posed)
+        turns, geo = dict[str, int](), dict[str, tuple[float, float, float]]()
+        for name in poses:
+            with suppress(ImageError):
+                turns[name] = quarter_turns(read_header(self.source(name))[1])
+            if self.positions is None and (position := gps_position(self.source(name))) is not None:
+                geo[name] = position
+        known = None if self.positions is None else read_positions(Path(self.positions))
+        if not poses:
+            return
+        placed, new_from_old = alignment(poses, turns, geo, known)
+        self.record["unit"] = placed.unit
+        if placed.unit is None:
+            self.notes += placed.notes or ["no photograph has GPS" if known is None else "no image has a position"]
+            return
+        rotation, scale = new_from_old.rotation.matrix(), new_from_old.scale
+        self.poses = {
+            frame: make_pose(rotation @ pose[:3, :3], new_from_old * pose[:3, 3]) for frame, pose in self.poses.items()
+        }
+        self.rigs = [(rig, sensor, make_pose(pose[:3, :3], scale * pose[:3, 3])) for rig, sensor, pose in self.rigs]
+        self.record |= placed.record
+        self.notes += placed.notes
+
+    def _camera_poses(self, images: Sequence[DraftImage]) -> dict[str, Floats]:
+        """Return world_from_cam (4, 4) of images that have one, by name."""
+        of_sensor = {(rig, sensor): rig_from_sensor for rig, sensor, rig_from_sensor in self.rigs}
+        return {
+            image.name: self.poses[image.frame] @ of_sensor[image.rig, image.sensor] if image.rig
+            else self.poses[image.frame]
+            for image in images if image.frame in self.poses
+        }  # fmt: skip
+
+    def _split(self, held: Collection[str]) -> "Draft":
+        """Move some frames to the draft of a query session."""
+        queries = replace(self, session=_session(self.session.parents[1], self.session.name[: -len("_map")], "query"))
+        for draft, is_query in ((self, False), (queries, True)):
+            draft.images = [image for image in draft.images if (image.frame in held) == is_query]
+            draft.poses = {frame: pose for frame, pose in draft.poses.items() if (frame in held) == is_query}
+            draft.rows = [row for row in draft.rows if (row["image"] in held) == is_query]
+        queries.notes, queries.others = [], {}
         return queries
 
     def source(self, name: str) -> Path:
@@ -188,19 +279,18 @@ class Draft:
         return self.sources.get(name, self.folder / name)
 
     def _find_masks(self) -> dict[str, Path]:
-        """Return the masks of the images by name, and note how many images have one.
+        """Return the masks of the images by name, and note those that do not fit.
 
         Raises:
             CaptureError: the user gave a folder of masks, but no image has one there.
         """
-        found = {image.name: self.mask_files.get(image.name) or find_mask(self.source(image.name), self.masks)
+        folder = None if self.masks is None else Path(self.masks)
+        found = {image.name: self.mask_files.get(image.name) or find_mask(self.source(image.name), folder)
                  for image in self.images}  # fmt: skip
         masks = {name: path for name, path in found.items() if path is not None}
-        first = self.images[0].name
-        if self.masks is not None and not masks:
-            raise CaptureError(f"{self.masks}: no mask of {self.folder}. Expected that of {first} as {first}.png.")
-        if masks:
-            self.notes.append(f"masks of {len(masks)} of {len(found)} images; no features where they are black")
+        if folder is not None and not masks:
+            first = self.images[0].name
+            raise CaptureError(f"{folder}: no mask of {self.folder}. Expected that of {first} as {first}.png.")
         for image in self.images:
             size = stored_size(masks[image.name]) if image.name in masks else (image.camera.width, image.camera.height)
             if size != (image.camera.width, image.camera.height):
@@ -276,29 +366,43 @@ class Draft:
             self.notes.append(f"{turned} images have an EXIF orientation, which is ignored: pixels are used as stored")
         times, masks = self._choose_times(), self._find_masks()
         columns = ["image", "status", "path", "timestamp", "sensor_id", "device_id", "camera"]
+        left_out = [(str(row["image"]), str(row["status"])) for row in self.rows]
+        left_out += [(name, reason) for reason, names in self.others.items() for name in names]
         for image in self.images:
             values = image.path, times[image.frame], image.sensor, image.device, camera_text(image.camera)
             self.rows.append(dict(zip(columns, (image.name, "imported", *values), strict=True)))
         self.rows = [row | {"image": printable(row["image"]), "status": printable(row["status"])} for row in self.rows]
         table = pd.DataFrame(self.rows, columns=columns).astype({"timestamp": "Int64"})
+        posed = list(self._camera_poses(self.images[:: max(1, len(self.images) // _MOST_FOR_UP)]).values())
+        up = ", ".join(f"{value + 0.0:.2f}" for value in up_of_cameras(posed)) if posed else ""
+        record = {
+            "unit": self.record.get("unit", "m"), "source": str(self.folder), "used": len(self.images),
+            "seen": len(self.images) + len(left_out),
+            "left out": grouped((printable(name), printable(reason)) for name, reason in left_out),
+            "cameras": cameras_of((image.sensor, image.camera, image.origin) for image in self.images),
+            "poses": len(self.poses), "convention": f"{self.convention}, {_AXES[self.axes]}",
+            "unit from": self.record.get("meters", self.unit_hint), "timestamps": [len(times), self.times_from],
+            "masks": [len(masks), "no features where they are black"] if masks else None, "notes": self.notes,
+        } | self.record  # fmt: skip
+        record["up"] = f"z, {record['up']}" if "up" in record else f"({up}), as most cameras are held"
         with write_folder(self.session) as session:
             files = [(self.source(image.name), session / RAW_DATA / image.path) for image in self.images]
             files += [(path, session / MASKS / f"{IMPORTED}{name}.png") for name, path in masks.items()]
             for source, target in files:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 if source.name.lower().endswith(HEIC_SUFFIXES):
-                    with PIL.Image.open(source) as picture:
-                        picture.convert("RGB").save(target, exif=picture.getexif())
+                    write_png(source, target)
                 elif self.placing == "copy":
                     shutil.copyfile(source, target)
                 else:
                     target.symlink_to(os.path.abspath(source))  # noqa: PTH100 - must not resolve links in the source
             self._write_tables(session, times)
             table.to_csv(session / "proc" / "import.csv", index=False)
-            (session / IMPORT_RECORD).write_text(json.dumps({"unit": self.unit} | self.record) + "\n", encoding="utf-8")
             if self.placing == "link":
                 note_linked_here(session)
-        return ImportReport(self.session, table, self.notes)
+            record["seconds"] = round(time.perf_counter() - self.started, 3)
+            (session / IMPORT_RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        return ImportReport(self.session, table, record)
 
     def _write_tables(self, session: Path, times: Mapping[str, int]) -> None:
         """Write the text files of the capture format; `times` are the timestamps of the frames, microseconds."""
@@ -371,66 +475,61 @@ class Draft:
             zone = ", in UTC, as its time zone changes" if in_zones else ""
             if zones and len(zones) < len(frames):
                 zone = "; only some images have a time zone, which is ignored"
-            how = "as given" if self.given_times else f"camera clock, from EXIF{zone}"
-            self.notes.append(f"timestamps: {how}")
+            self.times_from = "as given" if self.given_times else f"camera clock, from EXIF{zone}"
             return taken
         why = f"some images have {'no' if len(taken) < len(frames) else 'the same'} time in EXIF"
-        self.notes.append(f"timestamps: made up, one second apart in the order of the images ({why})")
+        self.times_from = f"made up, one second apart in the order of the images ({why})"
         return {frame: (number + 1) * 10**6 for number, frame in enumerate(frames)}
 
 
-def start(
-    capture: str | Path, device: str, split: str, folder: Path, placing: str, masks: str | Path | None = None
-) -> Draft:
+def start(capture: str | Path, device: str, split: str, folder: Path, **options: Unpack[Options]) -> Draft:
     """Return the draft of a new session. Raise CaptureError if it exists, ManifestError for an invalid argument."""
+    draft = Draft(_session(Path(capture), device, split), folder, **options)
+    if draft.placing not in PLACING:
+        raise ManifestError(f"images: unknown choice {draft.placing!r}. {nearest(draft.placing, PLACING)}")
+    if draft.axes not in AXES:
+        raise ManifestError(f"axes: unknown {draft.axes!r}. {nearest(draft.axes, AXES)}")
+    if draft.unit_m is not None and not 0 < draft.unit_m < np.inf:
+        raise ManifestError(f"unit: found {draft.unit_m:g}, expected the meters per unit of the poses, such as 0.01.")
+    if draft.hold_out and (draft.hold_out < 2 or split != "map"):
+        raise ManifestError(f"hold-out: found {draft.hold_out} for a {split}, expected 2 or more, for a map.")
+    if draft.hold_out:
+        _session(Path(capture), device, "query")
+    return draft
+
+
+def _session(capture: Path, device: str, split: str) -> Path:
+    """Return the folder of a new session. Raise CaptureError if it exists, ManifestError if its name is invalid."""
     if split not in SPLITS:
         raise ManifestError(f"split: unknown {split!r}. {nearest(split, SPLITS)}")
-    if placing not in PLACING:
-        raise ManifestError(f"images: unknown choice {placing!r}. {nearest(placing, PLACING)}")
     if not re.fullmatch(r"[a-z0-9-]+", device):  # the rule for `extra_devices` in a manifest
         raise ManifestError(f"device: found {device!r}, expected lower-case letters, digits and '-', such as drone.")
-    session = Path(capture) / "sessions" / f"{device}_{split}"
+    session = capture / "sessions" / f"{device}_{split}"
     if has_long_part(session.name, "session"):
         raise ManifestError(f"device: found {device!r}, expected fewer letters: a session's name has 40 bytes at most.")
     if session.exists():
         raise CaptureError(f"{session} exists already. Import into another capture or device, or remove it first.")
-    return Draft(session, folder, placing, masks=None if masks is None else Path(masks))
+    return session
 
 
-def write_drafts(*drafts: Draft) -> list[ImportReport]:
-    """Write sessions without the images that cannot be used.
+def every_nth(frames: Sequence[str], number: int) -> set[str]:
+    """Return every `number`-th of the frames, which becomes a query; none if it is 0.
 
     Raises:
-        CaptureError: a session has no image left; none is written.
+        ManifestError: there are fewer frames.
     """
-    for draft in drafts:
-        draft.leave_out()
-    return [draft.write() for draft in drafts]
+    if number > len(frames):
+        raise ManifestError(f"hold-out: found {number}, but there are {len(frames)} frames. Give a smaller number.")
+    return set(frames[number - 1 :: number]) if number else set()
 
 
-def write_with_queries(draft: Draft, hold_out: int) -> ImportReport:
-    """Write a session and, with `hold_out`, the queries of it; see `Draft.hold_out` and `write_drafts`."""
-    queries = draft.hold_out(hold_out)
-    report, *others = write_drafts(draft, *([queries] if queries else []))
-    report.held_out = others[0] if others else None
-    return report
-
-
-def require_hold_out(number: int, split: str, count: int) -> None:
-    """Raise ManifestError unless `number` is 0, or 2 to `count` images for a map."""
-    if number and (number < 2 or split != "map"):
-        raise ManifestError(f"hold-out: found {number} for a {split}, expected 2 or more, for a map.")
-    if number > count:
-        raise ManifestError(f"hold-out: found {number}, but there are {count} frames. Give a smaller number.")
-
-
-def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES, notes: list[str] | None = None) -> list[str]:
+def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES, draft: Draft | None = None) -> list[str]:
     """Return the images in and below a folder, sorted by path. Links to folders elsewhere are followed, each once.
 
     Sessions that an import has made are skipped, masks (see `images.find_mask`), and names that are not Unicode.
 
     Args:
-        notes: gets a line for each kind of files that are left out.
+        draft: gets the files that are left out, by the reason.
 
     Raises:
         CaptureError: there is no image.
@@ -439,16 +538,16 @@ def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES, notes:
     names = sorted((name for name in files if name.lower().endswith(suffixes) and not _is_mask(name)), key=Path)
     broken = [name for name in names if printable(name) != name]
     names = [name for name in names if name not in set(broken)] if broken else names
-    suffix_of = (name[name.rfind(".") :].lower() for name in files)
-    others = Counter(suffix for suffix in suffix_of if suffix in PHOTOGRAPHS and suffix not in suffixes)
-    said = [f"{count} files {suffix} are not read: {_HOW.get(suffix, CONVERT)}" for suffix, count in others.items()]
-    if broken:
-        said.append(f"{len(broken)} images have a name that is not UTF-8: rename them; first: {printable(broken[0])}")
-    if captures:
-        said.append(f"captures in the folder of images are skipped: {', '.join(captures[:3])}")
-    if notes is not None:
-        notes += said
+    others = {"its name is not UTF-8: rename it": broken} if broken else {}
+    for name in files:
+        if (suffix := name[name.rfind(".") :].lower()) in PHOTOGRAPHS and suffix not in suffixes:
+            others.setdefault(f"{suffix} is not read: {_HOW.get(suffix, CONVERT)}", []).append(name)
+    note = [f"captures in the folder of images are skipped: {', '.join(captures[:3])}"] if captures else []
+    if draft is not None:
+        draft.others |= others
+        draft.notes += note
     if not names:
+        said = [*(f"{len(found)} files: {reason}" for reason, found in others.items()), *note]
         why = "".join(f" {line[0].upper()}{line[1:]}." for line in said)
         raise CaptureError(f"{folder}: no image in or below it. Expected {', '.join(suffixes)}.{why}")
     return names
@@ -485,6 +584,13 @@ def heic_is_read() -> bool:
     return True
 
 
+def write_png(source: Path, target: Path) -> None:
+    """Write a photograph in another format as PNG with its EXIF tags. Raise `images.HEADER_ERRORS` if it is none."""
+    with PIL.Image.open(source) as image:
+        pixels, exif = image.convert("RGB"), image.getexif()  # in this order: Pillow turns a TIFF upright
+    pixels.save(target, "PNG", exif=exif)
+
+
 def printable(name: str) -> str:
     """Return a name in which bytes that are not UTF-8 are replaced."""
     return name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
@@ -500,9 +606,7 @@ def _composed(name: str) -> str:
 def _loose(name: str) -> str:
     name = _composed(name).replace("\\", "/").casefold()
     stem, dot, suffix = name.rpartition(".")
-    return stem if f"{dot}{suffix}" in (*IMAGE_SUFFIXES, *PHOTOGRAPHS) else name
-
-
+    return stem if f"{dot}{suffix}" in PHOTOGRAPHS else name
 
 
 def _is_mask(name: str) -> bool:
@@ -519,11 +623,3 @@ def posed_camera(world_from_named: Floats, axes: str, unit_m: float) -> Floats:
     """
     world_from_cam = world_from_named @ AXES[axes]
     return make_pose(world_from_cam[:3, :3], unit_m * world_from_cam[:3, 3])
-
-
-def require_convention(axes: str, unit_m: float) -> None:
-    """Raise ManifestError for unknown camera axes or a unit that is not a positive length."""
-    if axes not in AXES:
-        raise ManifestError(f"axes: unknown {axes!r}. {nearest(axes, AXES)}")
-    if not (np.isfinite(unit_m) and unit_m > 0):
-        raise ManifestError(f"unit: found {unit_m:g}, expected the meters per unit of the poses, such as 0.01.")

@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import PIL.Image
 import pycolmap
 
 from toolkit.capture import Session
 from toolkit.capture.folder import IMPORT_RECORD
+from toolkit.capture.images import HEADER_ERRORS, ORIENTATION, read_number
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.files import own_name, read_json
@@ -30,6 +32,7 @@ _EARTH_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84
 _SQUARE = _FLATTENING * (2 - _FLATTENING)  # squared eccentricity
 _LEAST_HORIZONTAL = 1e-3  # smallest horizontal part of an optical axis that has a heading
 GPS = "GPS in EXIF"
+_GPS_TAGS = 0x8825  # number of the EXIF tag
 
 
 @dataclass
@@ -73,23 +76,19 @@ def place(
         known = [geo[name] for name in images if name in geo]
         origin = np.median(known, axis=0) if known else np.zeros(3)
         positions = {name: east_north_up(np.array(geo[name]), origin) for name in images if name in geo}
-    unknown = "the unit of the model is not known: give --distance, --positions, or photographs with GPS. Lengths are "
-    unknown += "relative to the depth of the scene"
     common = [name for name in images if name in positions]
     if len(common) < 3:
-        return Placing(None, record, [*([f"{how}: {len(common)} photographs, expected 3"] if common else []), unknown])
+        return Placing(None, record, [f"{how}: {len(common)} photographs, expected 3"] if common else [])
     source = np.array([images[name].projection_center() for name in common])
     target = np.array([positions[name] for name in common])
     fitted = fit(source, target)
     if fitted is None:
-        return Placing(None, record, [f"{how}: does not fit the model", unknown])
+        return Placing(None, record, [f"{how}: does not fit the model"])
     new_from_old, inliers, residual_m, scale_deviation, level = fitted
     facts = f"{np.count_nonzero(inliers)} of {len(common)} photographs, residual {residual_m:.2g} m in the median, "
     facts += f"scale known to {100 * scale_deviation:.1g} %"
     if scale_deviation > MAX_SCALE_DEVIATION:
-        return Placing(
-            None, record, [f"{how}: of no use for the scale, as the cameras are too close ({facts})", unknown]
-        )
+        return Placing(None, record, [f"{how}: of no use for the scale, as the cameras are too close ({facts})"])
     model.transform(new_from_old)
     by = how if level else "the cameras"
     record |= {"meters": how, "residual_m": residual_m, "scale deviation": scale_deviation, "up": f"by {by}"}
@@ -178,6 +177,26 @@ def read_positions(path: Path) -> dict[str, Floats]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise CaptureError(f"{path}: cannot be read as a CSV table ({error}).") from None
     return positions
+
+
+def quarter_turns(exif: Mapping[int, Any]) -> int:
+    """Return the counter-clockwise quarter turns that make an image upright, from the orientation in EXIF."""
+    return {3: 2, 6: 3, 8: 1}.get(int(read_number(exif, ORIENTATION)), 0)
+
+
+def gps_position(path: Path) -> tuple[float, float, float] | None:
+    """Return latitude, longitude and altitude of the GPS tags; None without them."""
+    try:
+        with PIL.Image.open(path) as image:
+            tags = image.getexif().get_ifd(_GPS_TAGS)
+        degrees = [float(np.dot([float(value) for value in tags[key]], [1, 1 / 60, 1 / 3600])) for key in (2, 4)]
+        latitude, longitude = (
+            value * (-1 if str(tags[key]).upper() in "SW" else 1) for key, value in zip((1, 3), degrees, strict=True)
+        )
+        altitude = float(tags.get(6, 0.0)) * (-1 if tags.get(5) in (1, b"\x01") else 1)
+    except (*HEADER_ERRORS, KeyError, TypeError, ZeroDivisionError):
+        return None
+    return (latitude, longitude, altitude) if np.isfinite([latitude, longitude, altitude]).all() else None
 
 
 def _upright(image: pycolmap.Image, quarter_turns: int) -> Floats:

@@ -8,13 +8,11 @@ of hloc, `name MODEL width height parameters` per line, is accepted in place of 
 
 import csv
 import io
-import json
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import cv2
 import numpy as np
@@ -23,7 +21,7 @@ import pycolmap
 
 from toolkit.capture import parse_camera
 from toolkit.capture.folder import IMPORT_RECORD
-from toolkit.capture.images import decode, exif_camera, is_file, read_header
+from toolkit.capture.images import decode, exif_camera
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.colmap_model import (
@@ -40,18 +38,14 @@ from toolkit.exchange.drafts import (
     SUBSESSION,
     Draft,
     DraftImage,
-    ImportReport,
+    Options,
     heic_is_read,
     list_images,
-    posed_camera,
-    require_convention,
     start,
-    write_with_queries,
 )
-from toolkit.exchange.georeference import alignment, read_positions
-from toolkit.exchange.photographs import Photograph, gps_position
+from toolkit.exchange.import_report import ImportReport
 from toolkit.exchange.transforms import import_transforms
-from toolkit.files import file_fingerprint, files_fingerprint, read_json, write_text
+from toolkit.files import file_fingerprint, files_fingerprint, read_json
 from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
 from toolkit.manifest import nearest
 
@@ -61,8 +55,7 @@ _CAMERA_COLUMNS = ("model", "width", "height", "params")
 
 def import_colmap(
     model: str | Path, images: str | Path, capture: str | Path, device: str = "ios", split: str = "map",
-    placing: str = "link", axes: str = "opencv", unit_m: float | None = None, hold_out: int = 0,
-    match_names: bool = False, masks: str | Path | None = None, gps: bool = False, positions: str | Path | None = None,
+    **options: Unpack[Options],
 ) -> ImportReport:  # fmt: skip
     """Make a session from a COLMAP model and its images: cameras, poses, and the rigs that have several cameras.
 
@@ -75,27 +68,17 @@ def import_colmap(
         images: folder that the model's image names are relative to.
         capture: folder of the capture; created if it does not exist.
         device, split: the session is `<device>_<split>`. Poses of queries become their ground truth.
-        placing: `link` to the images, or `copy` them.
-        axes: camera axes of the poses, see `drafts.AXES`; COLMAP's are `opencv`.
-        unit_m: meters per unit of the poses; None: unknown, as after structure from motion. The poses are then not
-            scaled, and the session records that their unit is unknown.
-        hold_out: every `hold_out`-th frame of a map, in order of names, becomes a query with ground truth instead;
-            0: none.
-        match_names: take files whose names differ only in case, extension or separators.
-        gps: move the world to x east, y north, z up, in meters, by the GPS in EXIF of at least three images.
-        positions: the same by a CSV file with the columns image, x, y, z: camera centers, meters.
-        masks: folder of masks, see `images.find_mask`; they are placed as the images are.
+        options: see `drafts.Options`.
 
     Raises:
         CaptureError: no model in the folder, or a damaged one; the session exists already, or no image is left.
         ManifestError: an unknown split, placing or axes, a unit that is not a positive length, an invalid `hold_out`,
             or a device that cannot be part of a name.
     """
-    require_convention(axes, 1.0 if unit_m is None else unit_m)
-    draft = start(capture, device, split, Path(images), placing, masks)
-    draft.match_names = match_names
+    draft = start(capture, device, split, Path(images), **options)
     content = read_model(Path(model))
     draft.notes += content.notes
+    draft.convention, draft.listed_in = "cam_from_world of the model", "the model"
     rig_of_image = {
         image_id: (frame_id, frame)
         for frame_id, frame in content.frames.items()
@@ -109,7 +92,7 @@ def import_colmap(
             (f"{SUBSESSION}/rig_{rig_id}", sensors[rig_id, camera_id], inverse(sensor_from_rig))
             for camera_id, sensor_from_rig in calibrated.items()
         ]
-    moved, names, not_in_model = 0, set[str](), set[str]()
+    moved, names = 0, set[str]()
     for image_id, image in sorted(content.images.items()):
         frame_id, frame = rig_of_image.get(image_id, (f"image {image_id}", None))  # a frame may have the same number
         camera, pose = content.cameras.get(image.camera_id, "its camera is not in the model"), image.cam_from_world
@@ -127,30 +110,19 @@ def import_colmap(
         elif isinstance(camera, str) or isinstance(pose, str):
             draft.rows.append({"image": image.name, "status": camera if isinstance(camera, str) else pose})
         else:
-            draft.images.append(DraftImage(image.name, camera, sensor, f"{frame_id}", rig_name))
+            draft.images.append(DraftImage(image.name, camera, sensor, f"{frame_id}", rig_name, "given by the model"))
             draft.poses[f"{frame_id}"] = inverse(pose)
         names.add(image.name)
     if moved:
         draft.notes.append(f"{moved} images have another pose than their rig gives them: that of the rig is taken")
-    with suppress(CaptureError):  # the model may be of images in other formats
-        not_in_model = set(list_images(draft.folder)) - names
-    if not_in_model:
-        draft.notes.append(f"{len(not_in_model)} images of the folder are not in the model")
-    is_aligned = gps or positions is not None
-    if is_aligned and unit_m is not None:
-        raise ManifestError(f"unit: found {unit_m:g} together with GPS or positions, which tell the unit.")
-    draft.convert(axes, 1.0 if is_aligned else unit_m)
-    if is_aligned:
-        _align(draft, positions)
-    return write_with_queries(draft, hold_out)
+    return draft.finish()
 
 
 def import_images(
     images: str | Path, capture: str | Path, device: str = "ios", split: str = "query", table: str | Path | None = None,
     poses_are: str = "world_from_cam", camera: str | None = None, cameras: str | Path | None = None,
-    placing: str = "link", axes: str = "opencv", unit_m: float | None = 1.0, truth: str | Path | None = None,
-    hold_out: int = 0, match_names: bool = False, only: Sequence[str] | None = None, skip: Sequence[str] | None = None,
-    masks: str | Path | None = None, gps: bool = False, positions: str | Path | None = None,
+    truth: str | Path | None = None, only: Sequence[str] | None = None, skip: Sequence[str] | None = None,
+    **options: Unpack[Options],
 ) -> ImportReport:  # fmt: skip
     """Make a session from a folder of images without rigs.
 
@@ -159,7 +131,7 @@ def import_images(
 
     Args:
         images: folder; without a table, all JPEG and PNG files in and below it are imported.
-        capture, device, split, placing, masks: as for `import_colmap`. A map needs poses.
+        capture, device, split: as for `import_colmap`. A map needs poses.
         table: CSV file, see the module's docstring.
         poses_are: direction of the poses in table and truth: `world_from_cam`, `cam_from_world`, or
             `rotation_of_cam_from_world`, whose positions are the camera centers, as in NVM, Bundler and the Cambridge
@@ -167,12 +139,10 @@ def import_images(
         camera: intrinsics of all images, `MODEL, width, height, parameter, ...`, with COLMAP's models.
         cameras: COLMAP's cameras.txt. A single camera applies to all images; of several, the table's `camera_id`
             selects one.
-        axes: camera axes of the poses, see `drafts.AXES`.
-        unit_m: meters per unit of the poses; None: unknown, see `import_colmap`.
         truth: CSV file like the table; its poses become the ground truth of queries. Images not in it are queries
             without ground truth.
-        hold_out, match_names, gps, positions: as for `import_colmap`.
         only, skip: patterns such as `*.color.png`, without a table; only images of these names, and none of those.
+        options: see `drafts.Options`; `unit_m` is 1 by default.
 
     Raises:
         CaptureError: a malformed table or camera (names file and line), an image without intrinsics, a map without
@@ -182,13 +152,13 @@ def import_images(
     """
     if poses_are not in POSE_DIRECTIONS:
         raise ManifestError(f"poses_are: unknown {poses_are!r}. {nearest(poses_are, POSE_DIRECTIONS)}")
-    require_convention(axes, 1.0 if unit_m is None else unit_m)
-    draft, folder = start(capture, device, split, Path(images), placing, masks), Path(images)
+    options.setdefault("unit_m", 1.0)
+    draft, folder = start(capture, device, split, Path(images), **options), Path(images)
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder of images.")
-    draft.match_names = match_names
+    draft.convention = poses_are
     if table is not None:
-        rows = _read_table(Path(table))
+        rows, draft.listed_in = _read_table(Path(table)), "the table"
     else:
         rows = pd.DataFrame({"image": _listed(draft, folder, only or (), skip or ()), "line": 0})
     if split == "map" and "qw" not in rows:
@@ -197,31 +167,24 @@ def import_images(
     listed_cameras = read_cameras(Path(cameras)) if cameras is not None else {}
     shared_camera = None if camera is None else camera_at("camera", camera)
     posed = rows if truth is None else _read_truth(Path(truth), rows, split)
-    poses = _poses_of(posed, poses_are, axes, unit_m or 1.0)
+    poses = _poses_of(posed, poses_are)
     bad_poses = {str(row["image"]): f"line {row['line']}: {row['problem']}" for row in _bad(posed).to_dict("records")}
     if bad_poses and truth is not None:
         first = next(iter(bad_poses.items()))
         draft.notes.append(f"{len(bad_poses)} images have no usable ground truth; first: {first[0]}: {first[1]}")
-    origins = Counter[str]()
     for row in rows.to_dict("records"):
         name, where = str(row["image"]), f"{table}, line {row['line']}"
         try:
             if truth is None and name in bad_poses:
                 raise CaptureError(f"{table}, {bad_poses[name]}")
+            image_camera: pycolmap.Camera | str
             image_camera, origin = _camera_of(row, listed_cameras, shared_camera, folder / name, where)
         except (ImageError, CaptureError) as error:
-            draft.rows.append({"image": name, "status": str(error)})
-            continue
-        origins[origin] += 1
-        draft.add(name, image_camera, poses.get(name))
+            image_camera, origin = str(error), ""
+        draft.add(name, image_camera, poses.get(name), origin)
     if truth is not None:
         draft.notes.append(f"ground truth of {len(draft.poses)} of {len(rows)} images: {truth}")
-    draft.notes += [f"intrinsics of {count} images: {origin}" for origin, count in origins.items()]
-    if gps or positions is not None:
-        _align(draft, positions)
-    elif poses:
-        draft.note_unit(unit_m)
-    return write_with_queries(draft, hold_out)
+    return draft.finish()
 
 
 def import_once(
@@ -253,35 +216,31 @@ def import_once(
         raise CaptureError(f"{split}_images: {error}") from None
     inputs["files of images"] = files_fingerprint([Path(images) / name for name in names])
 
-    def make() -> str:
-        file, record = options.get("table"), session / IMPORT_RECORD
-        if file is not None and _is_transforms(file):
-            if Path(images).resolve() != Path(file).resolve().parent:
-                raise ManifestError(f"{split}_images: found {images}, expected the folder of {file}.")
-            if (found := options.get("poses_are", POSE_DIRECTIONS[0])) != POSE_DIRECTIONS[0]:
-                raise ManifestError(f"poses_are: found {found!r}, expected world_from_cam, the direction in {file}.")
-            report = import_transforms(file, capture, device, split, unit_m=unit_m, own_split=False)[0]
-        else:
-            report = import_images(images, capture, device, split, unit_m=unit_m, **options)
-        unknown = {"unit": None} if unit_m is None else {}
-        write_text(record, json.dumps(read_json(record) | unknown, indent=1) + "\n")
-        return report.text()
+    def make(record: dict[str, Any]) -> ImportReport:
+        file = options.get("table")
+        if file is None or not _is_transforms(file):
+            return import_images(images, capture, device, split, unit_m=unit_m, record=record, **options)
+        if Path(images).resolve() != Path(file).resolve().parent:
+            raise ManifestError(f"{split}_images: found {images}, expected the folder of {file}.")
+        if (found := options.get("poses_are", POSE_DIRECTIONS[0])) != POSE_DIRECTIONS[0]:
+            raise ManifestError(f"poses_are: found {found!r}, expected world_from_cam, the direction in {file}.")
+        return import_transforms(file, capture, device, split, own_split=False, unit_m=unit_m, record=record)
 
     return once(session, inputs, make)
 
 
-def once(session: Path, inputs: Mapping[str, Any], make: Callable[[], str]) -> str:
+def once(session: Path, inputs: Mapping[str, Any], make: Callable[[dict[str, Any]], ImportReport]) -> str:
     """Make a session, unless it was made before from the same inputs. Return a message for the user.
+
+    Args:
+        make: takes what `proc/import.json` is to have, see `drafts.Options`.
 
     Raises:
         CaptureError: the session was made from other inputs; names them.
     """
-    record = session / IMPORT_RECORD
     if not session.exists():
-        text = make()
-        write_text(record, json.dumps(read_json(record) | {"input": inputs}, indent=1) + "\n")
-        return text
-    before = read_json(record).get("input", {})
+        return make({"input": dict(inputs)}).text()
+    before = read_json(session / IMPORT_RECORD).get("input", {})
     if differing := [name for name in inputs if before.get(name) != inputs[name]]:
         changes = "; ".join(
             f"{name}: have changed" if name.split()[0] in ("content", "files") and name in before
@@ -311,50 +270,15 @@ def _sensors_of_rigs(rigs: Mapping[int, Mapping[int, pycolmap.Rigid3d | None]]) 
 # Cameras
 
 
-def _align(draft: Draft, positions: str | Path | None) -> None:
-    """Move the poses of a draft to the world of known camera centers, or of GPS in EXIF: z is up, in meters.
-
-    If they do not tell it, the poses stay, and their unit is noted as unknown.
-    """
-    of_sensor = {(rig, sensor): rig_from_sensor for rig, sensor, rig_from_sensor in draft.rigs}
-    posed = [image for image in draft.images if image.frame in draft.poses and is_file(draft.source(image.name))]
-    poses = {image.name: draft.poses[image.frame] for image in posed}
-    poses |= {image.name: poses[image.name] @ of_sensor[image.rig, image.sensor] for image in posed if image.rig}
-    turns, geo = dict[str, int](), dict[str, tuple[float, float, float]]()
-    for name in poses:
-        with suppress(ImageError):
-            photograph = Photograph(name, draft.source(name), read_header(draft.source(name))[1], None)
-            turns[name] = photograph.quarter_turns
-        if positions is None and (position := gps_position(draft.source(name))) is not None:
-            geo[name] = position
-    known = None if positions is None else read_positions(Path(positions))
-    if poses:
-        placed, new_from_old = alignment(poses, turns, geo, known)
-        if placed.unit is not None:
-            rotation, scale = new_from_old.rotation.matrix(), new_from_old.scale
-            draft.poses = {
-                frame: make_pose(rotation @ pose[:3, :3], new_from_old * pose[:3, 3])
-                for frame, pose in draft.poses.items()
-            }
-            draft.rigs = [
-                (rig, sensor, make_pose(pose[:3, :3], scale * pose[:3, 3])) for rig, sensor, pose in draft.rigs
-            ]
-            draft.record |= placed.record
-            draft.notes += placed.notes
-            return
-        draft.notes += placed.notes[:-1] or ["no photograph has GPS" if known is None else "no image has a position"]
-    draft.note_unit(None)
-
-
 def _listed(draft: Draft, folder: Path, only: Sequence[str], skip: Sequence[str]) -> list[str]:
     """Return the images of a folder that fit the patterns, and note what is left out or looks like no photograph."""
-    names = list_images(folder, (*READ_SUFFIXES, *(HEIC_SUFFIXES if heic_is_read() else ())), draft.notes)
+    names = list_images(folder, (*READ_SUFFIXES, *(HEIC_SUFFIXES if heic_is_read() else ())), draft)
     chosen = [name for name in names if not only or any(_fits(name, pattern) for pattern in only)]
     chosen = [name for name in chosen if not any(_fits(name, pattern) for pattern in skip)]
     if not chosen:
         raise CaptureError(f"{folder}: none of {len(names)} images fits the patterns {', '.join([*only, *skip])}.")
     if len(chosen) < len(names):
-        draft.notes.append(f"{len(names) - len(chosen)} images are left out by --only and --skip")
+        draft.others["by --only and --skip"] = sorted({*names} - {*chosen})
     pngs = [name for name in chosen if name.lower().endswith(".png")]
     sample = pngs[:: max(1, len(pngs) // 40)]
     flat = [name for name in sample if _is_no_photograph(folder / name)]
@@ -395,17 +319,17 @@ def _camera_of(
     """
     if "model" in row:
         text = ", ".join([row["model"], row["width"], row["height"], *str(row["params"]).split()])
-        return camera_at(where, text), "the table's"
+        return camera_at(where, text), "given by the table"
     if "camera_id" in row:
         if row["camera_id"] not in by_id:
             ids = ", ".join(by_id) or "none: give cameras.txt"
             raise CaptureError(f"{where}: camera_id {row['camera_id']!r} is not in cameras.txt (it has: {ids}).")
-        return _usable(by_id[row["camera_id"]]), "those of cameras.txt"
+        return _usable(by_id[row["camera_id"]]), "given by cameras.txt"
     if len(by_id) > 1:
         raise CaptureError(f"cameras.txt has {len(by_id)} cameras; give a table with the columns image, camera_id.")
     if by_id:
-        return _usable(next(iter(by_id.values()))), "the camera of cameras.txt"
-    return (shared, "the given camera") if shared is not None else exif_camera(path)
+        return _usable(next(iter(by_id.values()))), "given by cameras.txt"
+    return (shared, "given by --camera") if shared is not None else exif_camera(path)
 
 
 def _usable(camera: pycolmap.Camera | str) -> pycolmap.Camera:
@@ -440,8 +364,8 @@ def _read_truth(path: Path, images: pd.DataFrame, split: str) -> pd.DataFrame:
     return rows
 
 
-def _poses_of(rows: pd.DataFrame, poses_are: str, axes: str, unit_m: float) -> dict[str, Floats]:
-    """Return world_from_cam (4, 4), meters, by image with a valid pose; empty if the table has no poses."""
+def _poses_of(rows: pd.DataFrame, poses_are: str) -> dict[str, Floats]:
+    """Return world_from_cam (4, 4) by image with a valid pose; empty if the table has no poses."""
     if "qw" not in rows:
         return {}
     rows = rows[rows["problem"] == ""]
@@ -450,7 +374,7 @@ def _poses_of(rows: pd.DataFrame, poses_are: str, axes: str, unit_m: float) -> d
         poses = invert(poses)
     elif poses_are == "rotation_of_cam_from_world":
         poses = make_pose(np.swapaxes(poses[:, :3, :3], 1, 2), poses[:, :3, 3])
-    return {str(name): posed_camera(pose, axes, unit_m) for name, pose in zip(rows["image"], poses, strict=True)}
+    return dict(zip(map(str, rows["image"]), poses, strict=True))
 
 
 def _bad(rows: pd.DataFrame) -> pd.DataFrame:
@@ -458,15 +382,12 @@ def _bad(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[rows["problem"] != ""] if "qw" in rows else rows[:0]
 
 
-def read_poses(
-    table: Path, poses_are: str, axes: str, unit_m: float
-) -> tuple[list[str], dict[str, Floats]]:  # fmt: skip
-    """Return the images of a table, and their world_from_cam (4, 4) in meters; see `import_images`."""
+def read_poses(table: Path, poses_are: str) -> tuple[list[str], dict[str, Floats]]:
+    """Return the images of a table, and their world_from_cam (4, 4) in the table's unit; see `import_images`."""
     if poses_are not in POSE_DIRECTIONS:
         raise ManifestError(f"poses_are: unknown {poses_are!r}. {nearest(poses_are, POSE_DIRECTIONS)}")
-    require_convention(axes, unit_m)
     rows = _read_table(table)
-    return list(rows["image"]), _poses_of(rows, poses_are, axes, unit_m)
+    return list(rows["image"]), _poses_of(rows, poses_are)
 
 
 def _read_table(path: Path) -> pd.DataFrame:

@@ -4,6 +4,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Unpack
 
 import cv2
 import numpy as np
@@ -14,7 +15,8 @@ from tqdm.auto import tqdm
 from toolkit.capture.images import default_workers, find_mask, prefetch, read_image
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError, ImageError
-from toolkit.exchange.drafts import SUBSESSION, DraftImage, ImportReport, list_images, start, write_drafts
+from toolkit.exchange.drafts import AXES, SUBSESSION, DraftImage, Options, list_images, start
+from toolkit.exchange.import_report import ImportReport
 from toolkit.exchange.interchange import read_poses
 from toolkit.geometry import Floats, make_pose
 
@@ -24,7 +26,7 @@ _LARGEST = 2**15 - 1  # side of an image that cv2.remap can read, pixels
 
 def import_panoramas(
     images: str | Path, capture: str | Path, device: str = "ios", split: str = "query", table: str | Path | None = None,
-    poses_are: str = "world_from_cam", axes: str = "opencv", unit_m: float = 1.0, masks: str | Path | None = None,
+    poses_are: str = "world_from_cam", **options: Unpack[Options],
 ) -> ImportReport:  # fmt: skip
     """Make a session of equirectangular panoramas: a map with poses, or queries, whose poses become ground truth.
 
@@ -35,7 +37,8 @@ def import_panoramas(
     Args:
         images: folder of JPEG and PNG files.
         capture, device, split: as for `interchange.import_colmap`.
-        table, poses_are, axes, unit_m: as for `interchange.import_images`, with a row for each panorama.
+        table, poses_are: as for `interchange.import_images`, with a row for each panorama.
+        options: see `drafts.Options`; `unit_m` is 1 by default.
 
     Raises:
         CaptureError: a malformed table, a map without poses, two panoramas of one name, the session exists already, or
@@ -43,8 +46,10 @@ def import_panoramas(
         ManifestError: as for `interchange.import_images`.
     """
     folder = Path(images)
-    draft = start(capture, device, split, folder, "copy")
-    listed, poses = (list_images(folder), {}) if table is None else read_poses(Path(table), poses_are, axes, unit_m)
+    options["placing"], masks = "copy", options.pop("masks", None)  # masks are cut here
+    options.setdefault("unit_m", 1.0)
+    draft = start(capture, device, split, folder, **options)
+    listed, poses = (list_images(folder, draft=draft), {}) if table is None else read_poses(Path(table), poses_are)
     if split == "map" and not poses:
         raise CaptureError(f"A map needs poses: give a table with the columns image, {', '.join(POSE_NAMES)}.")
     stems = Counter(str(Path(name).with_suffix("")) for name in listed)
@@ -71,15 +76,18 @@ def import_panoramas(
             for yaw in YAWS_DEG:
                 view = (Path(name).with_suffix("") / f"{yaw:03d}.jpg").as_posix()
                 rig = f"{SUBSESSION}/panorama_{size}"
-                draft.images.append(DraftImage(view, camera, f"{rig}_{yaw:03d}", name, rig))
+                draft.images.append(DraftImage(view, camera, f"{rig}_{yaw:03d}", name, rig, "a view of 90 degrees"))
                 draft.sources[view] = out / view
             if name in poses:
                 draft.poses[name] = poses[name]
         for side, size in sizes.items():
             draft.notes.append(f"panoramas are cut into {len(YAWS_DEG)} views of 90 degrees, {side} x {side} pixels")
             rig = f"{SUBSESSION}/panorama_{size}"
-            draft.rigs += [(rig, f"{rig}_{yaw:03d}", make_pose(turn, np.zeros(3))) for yaw, turn in _rig_from_views()]
-        return write_drafts(draft)[0]
+            turn = AXES[draft.axes]  # views have the same place in the panorama, whatever axes the poses have
+            draft.rigs += [(rig, f"{rig}_{yaw:03d}", turn @ make_pose(rotation, np.zeros(3)) @ turn)
+                           for yaw, rotation in _rig_from_views()]  # fmt: skip
+        draft.convention = poses_are
+        return draft.finish()
 
 
 def _existing_parent(path: Path) -> Path:

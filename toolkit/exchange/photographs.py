@@ -7,31 +7,35 @@ from typing import Any
 
 import cv2
 import numpy as np
-import PIL.Image
 import pycolmap
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture.images import (
     HEADER_ERRORS,
-    ORIENTATION,
     exif_camera,
     exif_key,
     find_mask,
     read_header,
-    read_number,
 )
 from toolkit.errors import CaptureError, ImageError
-from toolkit.exchange.drafts import HEIC_SUFFIXES, IMAGE_SUFFIXES, heic_is_read, list_images
+from toolkit.exchange.drafts import (
+    CONVERTED_SUFFIXES,
+    HEIC_SUFFIXES,
+    IMAGE_SUFFIXES,
+    VIDEO_SUFFIXES,
+    heic_is_read,
+    list_images,
+    write_png,
+)
+from toolkit.exchange.georeference import gps_position, quarter_turns
 from toolkit.files import write_atomic
 from toolkit.scene.query import FOCAL_PRIOR
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-OTHER_SUFFIXES = (".webp", ".tif", ".tiff", ".bmp", ".gif", ".jp2", *HEIC_SUFFIXES, ".avif")
-"""Formats that are converted to PNG; HEIC needs the package pillow-heif."""
+TAKEN_SUFFIXES = (*IMAGE_SUFFIXES, *CONVERTED_SUFFIXES, *VIDEO_SUFFIXES)
+"""Formats of which photographs are made."""
 STEP = 0.06  # motion of the image between chosen frames of a video, in multiples of its width
 _SMALL = 320  # width of the frames whose motion is measured, pixels
-_GPS = 0x8825
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,7 @@ class Photograph:
     @property
     def quarter_turns(self) -> int:
         """Counter-clockwise quarter turns that make the image upright, from the orientation in EXIF."""
-        return {3: 2, 6: 3, 8: 1}.get(int(read_number(self.exif, ORIENTATION)), 0)
+        return quarter_turns(self.exif)
 
 
 def gather(
@@ -85,7 +89,7 @@ def _files(sources: Sequence[Path], made: Path, fps: float | None, prefixed: boo
     for source in sources:
         prefix = f"{source.stem if source.is_file() else source.resolve().name}/" if prefixed else ""
         if source.is_dir():
-            for name in list_images(source, (*IMAGE_SUFFIXES, *OTHER_SUFFIXES, *VIDEO_SUFFIXES)):
+            for name in list_images(source, TAKEN_SUFFIXES):
                 if (source / name).absolute().is_relative_to(made.absolute().parents[1]):
                     continue  # the capture is in the folder of the photographs, from a command that was stopped
                 if name.lower().endswith(VIDEO_SUFFIXES):
@@ -95,10 +99,10 @@ def _files(sources: Sequence[Path], made: Path, fps: float | None, prefixed: boo
                     yield prefix + name, source / name
         elif source.suffix.lower() in VIDEO_SUFFIXES:
             yield from _frames(source, made, f"{source.stem}/", fps)
-        elif source.is_file() and source.suffix.lower() in (*IMAGE_SUFFIXES, *OTHER_SUFFIXES):
+        elif source.is_file() and source.suffix.lower() in TAKEN_SUFFIXES:
             yield source.name, source
         else:
-            expected = ", ".join((*IMAGE_SUFFIXES, *OTHER_SUFFIXES, *VIDEO_SUFFIXES))
+            expected = ", ".join(TAKEN_SUFFIXES)
             raise CaptureError(
                 f"{source}: no folder, image or video. Expected a folder, or a file ending in {expected}."
             )
@@ -113,10 +117,8 @@ def _converted(name: str, path: Path, made: Path) -> tuple[str, Path]:
         if path.suffix.lower() in HEIC_SUFFIXES and not heic_is_read():
             raise ImageError("HEIC cannot be read: pip install pillow-heif, or convert it to JPEG")
         try:
-            with PIL.Image.open(path) as image:
-                pixels, exif = image.convert("RGB"), image.getexif()  # in this order: Pillow turns a TIFF upright
             with write_atomic(target) as temporary:
-                pixels.save(temporary, exif=exif)
+                write_png(path, temporary)
         except HEADER_ERRORS as error:
             raise ImageError(f"cannot be read as an image ({error})") from None
     return f"{name}.png", target
@@ -231,18 +233,3 @@ def _initial(path: Path, size: tuple[int, int]) -> pycolmap.Camera:
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
     camera.has_prior_focal_length = known
     return camera
-
-
-def gps_position(path: Path) -> tuple[float, float, float] | None:
-    """Return latitude, longitude and altitude of the GPS tags; None without them."""
-    try:
-        with PIL.Image.open(path) as image:
-            tags = image.getexif().get_ifd(_GPS)
-        degrees = [float(np.dot([float(value) for value in tags[key]], [1, 1 / 60, 1 / 3600])) for key in (2, 4)]
-        latitude, longitude = (
-            value * (-1 if str(tags[key]).upper() in "SW" else 1) for key, value in zip((1, 3), degrees, strict=True)
-        )
-        altitude = float(tags.get(6, 0.0)) * (-1 if tags.get(5) in (1, b"\x01") else 1)
-    except (*HEADER_ERRORS, KeyError, TypeError, ZeroDivisionError):
-        return None
-    return (latitude, longitude, altitude) if np.isfinite([latitude, longitude, altitude]).all() else None

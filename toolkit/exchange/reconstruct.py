@@ -10,10 +10,10 @@ import logging
 import shutil
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import pycolmap
@@ -25,19 +25,11 @@ from toolkit.capture.cameras import camera_text
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.embedders.vlad import Vlad
 from toolkit.errors import CaptureError, ManifestError, WeightsError
-from toolkit.exchange.drafts import (
-    IMAGE_SUFFIXES,
-    SUBSESSION,
-    Draft,
-    DraftImage,
-    ImportReport,
-    list_images,
-    start,
-    write_drafts,
-)
+from toolkit.exchange.drafts import SUBSESSION, Draft, DraftImage, Options, every_nth, list_images, start
 from toolkit.exchange.georeference import RECORD, place, read_positions
+from toolkit.exchange.import_report import ImportReport
 from toolkit.exchange.interchange import once
-from toolkit.exchange.photographs import OTHER_SUFFIXES, VIDEO_SUFFIXES, Photograph, gather, initial_cameras
+from toolkit.exchange.photographs import TAKEN_SUFFIXES, Photograph, gather, initial_cameras
 from toolkit.features.features import KINDS, LocalFeatures
 from toolkit.features.matching import (
     LocalMethod,
@@ -53,6 +45,7 @@ from toolkit.features.verification import epipolar_matches
 from toolkit.files import IMPORTED, files_fingerprint, link_folder, write_text
 from toolkit.geometry import Floats, Ints, make_pose, unit
 from toolkit.manifest import LocalizeSettings, SiftSettings
+from toolkit.scene.query import FOCAL_PRIOR
 from toolkit.store.items import Items, heals
 from toolkit.threads import one_thread
 
@@ -77,17 +70,10 @@ _BATCH = 64  # pairs that are matched at once
 class Reconstruction:
     """The result of `reconstruct`."""
 
-    reports: list[ImportReport]
-    record: dict[str, Any]
+    report: ImportReport
     points: Floats  # (P, 3) in the world
     colors: NDArray[np.uint8]  # (P, 3) RGB
-    notes: list[str] = field(default_factory=list)
-
     camera: str = ""  # option for queries of the same camera, if the photographs have one
-
-    def text(self) -> str:
-        """Return what was made, as text."""
-        return "\n".join([*self.notes, *(report.text() for report in self.reports)])
 
 
 class _Mutual(MutualMatcher):
@@ -118,7 +104,7 @@ class _Work:
         self.camera_of, self.cameras = initial_cameras(photographs, given)
         session = folder / "sessions" / f"{device}_map"
         shutil.rmtree(session, ignore_errors=True)
-        draft = Draft(session, folder, "link", sources={item.name: item.path for item in photographs})
+        draft = Draft(session, folder, sources={item.name: item.path for item in photographs})
         for item, number in zip(photographs, self.camera_of, strict=True):
             draft.images.append(
                 DraftImage(item.name, self.cameras[number], f"{SUBSESSION}/cam_{number + 1}", item.name)
@@ -344,10 +330,9 @@ def _quiet() -> Iterator[None]:
 
 @heals
 def reconstruct(
-    sources: Sequence[str | Path], capture: str | Path, device: str = "ios", hold_out: int = 0,
-    fps: float | None = None, camera: str | None = None, distance: tuple[str, str, float] | None = None,
-    positions: str | Path | None = None, mapper: str = "incremental", placing: str = "link",
-    masks: str | Path | None = None,
+    sources: Sequence[str | Path], capture: str | Path, device: str = "ios", fps: float | None = None,
+    camera: str | None = None, distance: tuple[str, str, float] | None = None, mapper: str = "incremental",
+    **options: Unpack[Options],
 ) -> Reconstruction:  # fmt: skip
     """Make a map session from photographs without poses, and with `hold_out` a query session with ground truth.
 
@@ -355,28 +340,23 @@ def reconstruct(
         sources: image files, folders of images and videos.
         capture: folder of the capture; created if it does not exist.
         device: the sessions are `<device>_map` and `<device>_query`.
-        hold_out: every `hold_out`-th photograph becomes a query; 0: none.
         fps: frames per second of videos; None: chosen by motion.
         camera: intrinsics of all photographs, `MODEL, width, height, parameter, ...`, kept as they are; None:
             estimated, from EXIF if it has a focal length.
         distance: two points, `IMAGE:x,y` in pixels, or images for the centers of their cameras, and the meters
             between.
-        positions: CSV file with the columns image, x, y, z: known camera centers, meters.
         mapper: COLMAP's `incremental` or `global` mapper.
-        placing: `link` to the photographs, or `copy` them.
-        masks: folder of masks, see `images.find_mask`.
+        options: see `drafts.Options`; GPS in EXIF is used in any case.
 
     Raises:
         CaptureError: no photograph, no two that fit together, a session that exists, or a malformed file.
         ManifestError: a malformed argument.
     """
-    if hold_out == 1 or hold_out < 0:
-        raise ManifestError(f"hold_out: found {hold_out}, expected 2 or more, or 0.")
     if mapper not in ("incremental", "global"):
         raise ManifestError(f"mapper: found {mapper!r}, expected incremental or global.")
     folder = Path(capture) / FOLDER
-    splits = ("map", "query") if hold_out else ("map",)
-    drafts = [start(capture, device, split, folder, placing) for split in splits]
+    positions, masks = options.pop("positions", None), options.pop("masks", None)
+    draft = start(capture, device, "map", folder, **options)
     masks = None if masks is None else Path(masks)
     photographs, unreadable = gather(list(map(Path, sources)), folder / "images", fps, masks)
     known = read_positions(Path(positions)) if positions is not None else None
@@ -388,9 +368,8 @@ def reconstruct(
             raise ManifestError(f"camera: {error}") from None
     if not photographs:
         raise CaptureError(f"{sources[0]}: no photograph can be read. First: {next(iter(unreadable.items()))}")
-    if hold_out > len(photographs):
-        raise ManifestError(f"hold_out: found {hold_out}, but there are {len(photographs)} photographs. Give less.")
     work = _Work(folder, device, photographs, given)
+    held = every_nth([item.name for item in work.photographs], draft.hold_out)
     work.unusable |= unreadable
     matcher = _Mutual(RATIO, shorten=KINDS["sift"].shorten)
     work.extract(LocalMethod("sift", SiftExtractor(), matcher), range(len(work)))
@@ -416,44 +395,44 @@ def reconstruct(
         camera_id: f"{SUBSESSION}/cam_{number}" for number, camera_id in enumerate(sorted(model.cameras), start=1)
     }
     images = {image.name: image for image in model.images.values() if image.has_pose}
-    for number, (name, item) in enumerate(zip(work.names, work.photographs, strict=True)):
+    for name, item, number in zip(work.names, work.photographs, work.camera_of, strict=True):
         if name in images:
-            draft = drafts[1 if hold_out and number % hold_out == hold_out - 1 else 0]
-            image = images[name]
-            draft.images.append(DraftImage(item.name, image.camera, sensors[image.camera_id], item.name))
+            image, known_focal = images[name], work.cameras[number].has_prior_focal_length
+            origin = f"estimated, started at {'EXIF' if known_focal else f'{FOCAL_PRIOR} times the longer side'}"
+            origin = "given by --camera" if given is not None else origin
+            draft.images.append(DraftImage(item.name, image.camera, sensors[image.camera_id], item.name, origin=origin))
             pose = image.cam_from_world().inverse()
             draft.poses[item.name] = make_pose(pose.rotation.matrix(), pose.translation)
             draft.sources[item.name] = item.path
             if item.mask is not None:
                 draft.mask_files[item.name] = item.mask
-    reasons = _reasons(work, models)
-    drafts[0].rows += [{"image": name, "status": reason} for name, reason in reasons.items()]
-    for draft in drafts:
-        draft.unit = placed.unit
-    sizes = [each.num_reg_images() for each in models]
+    draft.rows += [{"image": name, "status": reason} for name, reason in _reasons(work, models).items()]
+    sizes, error_px = [each.num_reg_images() for each in models], model.compute_mean_reprojection_error()
     record = {
         "photographs": len(photographs) + len(unreadable), "registered": sizes[0], "other models": sizes[1:],
         "mapper": mapper, "features": [method.name for method, _ in work.kinds],
         "points": model.num_points3D(), "track length": model.compute_mean_track_length(),
-        "reprojection error, px": model.compute_mean_reprojection_error(), **placed.record,
+        "reprojection error, px": error_px, **placed.record,
     }  # fmt: skip
-    reports = write_drafts(*drafts)
-    for report in reports:
-        write_text(report.session / RECORD, json.dumps(record, indent=1) + "\n")
-        _hand_over(work, report.session)
-    focal = ", ".join(f"{each.mean_focal_length():.0f}" for each in list(model.cameras.values())[:5])
-    notes.insert(0, f"{sizes[0]} of {record['photographs']} photographs in the model, {record['points']} points, "
-                 f"reprojection error {record['reprojection error, px']:.2f} px, focal lengths {focal} px")  # fmt: skip
+    draft.record |= {"source": ", ".join(map(str, sources)), **placed.record}
+    draft.unit_hint = "If you know a length, give --distance or --positions, or photographs with GPS"
+    draft.convention = "found by structure from motion"
+    draft.notes += [f"{sizes[0]} of {record['photographs']} photographs in the model, {record['points']} points, "
+                    f"reprojection error {error_px:.2f} px", *notes]  # fmt: skip
     if sizes[1:]:
         where = ", ".join(
             f"{size} in {folder_of_models / str(number)}" for number, size in enumerate(sizes[1:], start=1)
         )
-        notes.append(f"not connected to it, so not used: models of {where}")
+        draft.notes.append(f"not connected to it, so not used: models of {where}")
+    draft.notes += placed.notes
+    report = draft.finish({name for name in held if name in draft.poses})
+    for one in filter(None, (report, report.held_out)):
+        write_text(one.session / RECORD, json.dumps(record, indent=1) + "\n")
+        _hand_over(work, one.session)
     points = list(model.points3D.values())
     xyz, rgb = np.array([point.xyz for point in points]), np.array([point.color for point in points], np.uint8)
-    notes += placed.notes
     option = f" --camera '{camera_text(next(iter(model.cameras.values())))}'" if len(model.cameras) == 1 else ""
-    return Reconstruction(reports, record, xyz.reshape(-1, 3), rgb.reshape(-1, 3), notes, option)
+    return Reconstruction(report, xyz.reshape(-1, 3), rgb.reshape(-1, 3), option)
 
 
 def reconstruct_once(
@@ -470,11 +449,14 @@ def reconstruct_once(
         ManifestError: as for `reconstruct`.
     """
     source = Path(photographs)
-    names = [""] if source.is_file() else list_images(source, (*IMAGE_SUFFIXES, *OTHER_SUFFIXES, *VIDEO_SUFFIXES))
+    names = [""] if source.is_file() else list_images(source, TAKEN_SUFFIXES)
     inputs = {"photographs": str(source.resolve()), "hold_out": hold_out, "camera": camera}
     inputs["files of photographs"] = files_fingerprint([source / name for name in names])
     session = Path(capture) / "sessions" / f"{device}_map"
-    return once(session, inputs, lambda: reconstruct([source], capture, device, hold_out, camera=camera).text())
+    return once(
+        session, inputs,
+        lambda record: reconstruct([source], capture, device, camera=camera, hold_out=hold_out, record=record).report,
+    )  # fmt: skip
 
 
 def _escalate(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> list[str]:

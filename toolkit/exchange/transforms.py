@@ -21,7 +21,7 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import pycolmap
@@ -32,13 +32,11 @@ from toolkit.capture.tables import FARTHEST_M
 from toolkit.errors import CaptureError, ImageError
 from toolkit.exchange.drafts import (
     IMAGE_SUFFIXES,
-    ImportReport,
-    posed_camera,
-    require_convention,
-    require_hold_out,
+    Options,
+    every_nth,
     start,
-    write_drafts,
 )
+from toolkit.exchange.import_report import ImportReport
 from toolkit.geometry import Floats
 
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -47,39 +45,30 @@ TOLERANCE = 1e-3  # largest deviation of R^T R from the identity, per element, t
 
 
 def import_transforms(
-    path: str | Path, capture: str | Path, device: str = "ios", split: str = "map", placing: str = "link",
-    axes: str = "opengl", unit_m: float | None = None, hold_out: int = 0, undo_applied: bool = False,
-    match_names: bool = False, own_split: bool = True, masks: str | Path | None = None,
-) -> list[ImportReport]:  # fmt: skip
+    path: str | Path, capture: str | Path, device: str = "ios", split: str = "map", undo_applied: bool = False,
+    own_split: bool = True, **options: Unpack[Options],
+) -> ImportReport:  # fmt: skip
     """Make a session, or a map and a query session, from a transforms.json. Images keep their `file_path` as names.
 
     Args:
-        capture, device, split, placing, masks: as for `interchange.import_colmap`.
-        axes: camera axes of the matrices, see `drafts.AXES`.
-        unit_m: meters per unit of the poses; None: unknown, as after structure from motion. The poses are then not
-            scaled, and the session records that their unit is unknown.
-        hold_out: every `hold_out`-th frame of a map, in order of names, becomes a query with ground truth instead;
-            0: none, or those that the file names (`test_filenames`, `val_filenames`), if `own_split`.
+        capture, device, split: as for `interchange.import_colmap`.
         undo_applied: return to the world before `applied_transform` and `applied_scale`, as of the COLMAP model that
             the file was made from.
-        match_names: take files whose names differ only in case, extension or separators.
-
-    Returns:
-        The reports of the sessions, the map first.
+        own_split: without `hold_out`, the images of a map that the file names in `test_filenames` and `val_filenames`
+            become queries.
+        options: see `drafts.Options`; `axes` are `opengl` by default.
 
     Raises:
         CaptureError: a malformed file (names frame and key), or a session that exists already or has no usable image.
         ManifestError: an unknown split, placing or axes, a unit that is not a positive length, or an invalid
             `hold_out`.
     """
-    require_convention(axes, 1.0 if unit_m is None else unit_m)
-    require_hold_out(hold_out, split, hold_out)
     path = Path(path)
+    options.setdefault("axes", "opengl")
+    draft = start(capture, device, split, path.parent, **options)
     content = _read(path)
     held = _named(content, "val_filenames", "test_filenames")
-    own_split = own_split and bool(held) and split == "map" and not hold_out
-    splits = (split, "query") if hold_out or own_split else (split,)
-    drafts = [start(capture, device, name, path.parent, placing, masks) for name in splits]
+    own_split = own_split and bool(held) and split == "map" and not draft.hold_out
     frames: dict[str, _Frame] = {}
     applied = _applied(path, content)
     for number, entry in enumerate(content["frames"]):
@@ -87,42 +76,32 @@ def import_transforms(
         if frame.name in frames:
             raise frame.error("file_path", f"that of frame {frames[frame.name].number} again", "one frame per image")
         frames[frame.name] = frame
-    require_hold_out(hold_out, split, len(frames))
     trained = _named(content, "train_filenames") or {frame.listed for frame in frames.values()} - held
-    for index, name in enumerate(sorted(frames)):
-        frame = frames[name]
-        is_query = frame.listed in held if own_split else hold_out and index % hold_out == hold_out - 1
-        draft = drafts[1 if is_query else 0]
+    for name, frame in sorted(frames.items()):
         try:
             if own_split and frame.listed not in held | trained:
                 raise CaptureError("it is in none of train_filenames, val_filenames and test_filenames")
             world_from_named = frame.world_from_named()
             if undo_applied:
                 world_from_named = _undone(world_from_named, *applied)
-            draft.add(name, frame.camera(), posed_camera(world_from_named, axes, unit_m or 1.0))
+            draft.add(name, frame.camera(), world_from_named, f"given by {path.name}")
         except (ImageError, CaptureError) as error:
-            draft.rows.append({"image": name, "status": str(error)})
-    folders = {PurePosixPath(name).parent for name in frames}
-    files = [file for folder in folders for file in (path.parent / folder).glob("*")]
-    images = {file.relative_to(path.parent).as_posix() for file in files if file.suffix.lower() in IMAGE_SUFFIXES}
-    not_in_file = images - set(frames)
-    if not_in_file:
-        drafts[0].notes.append(f"{len(not_in_file)} images beside these are not in {path.name}")
+            draft.add(name, str(error), None, "")
+    draft.listed_in, draft.beside = path.name, True
     if own_split:
-        drafts[0].notes.append("map and queries: train_filenames, and val_filenames and test_filenames of the file")
+        draft.notes.append("map and queries: train_filenames, and val_filenames and test_filenames of the file")
     elif held and split == "map":
-        drafts[0].notes.append(f"val_filenames and test_filenames ({len(held)} images) of the file are not used")
+        draft.notes.append(f"val_filenames and test_filenames ({len(held)} images) of the file are not used")
     if found := sum(frame.from_elsewhere for frame in frames.values()):
-        drafts[0].notes.append(f"{found} images have paths of another machine: their ends are in this folder")
+        draft.notes.append(f"{found} images have paths of another machine: their ends are in this folder")
     turn, scale = applied
     if not (np.array_equal(turn, np.eye(4)) and scale == 1):
         world = "that of the file's input" if undo_applied else "the file's, turned from that of its input"
         other = "" if undo_applied else ". For the input's, as of a COLMAP model beside it, give --undo-applied"
-        drafts[0].notes.append(f"applied_transform, applied_scale {scale:g}: the world is {world}{other}")
-    for draft in drafts:
-        draft.match_names = match_names
-        draft.note_unit(unit_m)
-    return write_drafts(*drafts)
+        draft.notes.append(f"applied_transform, applied_scale {scale:g}: the world is {world}{other}")
+    if own_split:
+        return draft.finish({name for name, frame in frames.items() if frame.listed in held})
+    return draft.finish(every_nth(sorted(frames), draft.hold_out))
 
 
 def _read(path: Path) -> dict[str, Any]:
