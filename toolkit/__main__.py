@@ -62,6 +62,7 @@ _SPLIT = "A map needs poses; those of queries become ground truth."
 Split = Annotated[str, Option(metavar="map|query", help=_SPLIT)]
 Unit = Annotated[float | None, Option("--unit", metavar="METERS", help="Meters per unit of the poses if known.")]
 MeterUnit = Annotated[float, Option("--unit", metavar="METERS", help="Meters per unit of the poses, e.g. 0.01.")]
+Replace = Annotated[bool, Option("--replace", help="Replace the session if it exists.")]
 ReportJson = Annotated[bool, Option("--json", help="Print the report as JSON, as in proc/import.json.")]
 MatchNames = Annotated[
     bool, Option("--match-names", help="Take files whose names differ only in case, extension or separators.")
@@ -355,6 +356,8 @@ def _shared(
     masks: Masks = None,
     gps: Gps = False,
     positions: Positions = None,
+    replace: Replace = False,
+    add: Annotated[bool, Option("--add", help="Add the images that the session lacks; the others stay.")] = False,
     as_json: ReportJson = False,
 ) -> None:
     """Hold the options of all imports, see `exchange.drafts.Options`."""
@@ -481,6 +484,7 @@ def reconstruct(
     placing: Placing = "link",
     masks: Masks = None,
     remove: Annotated[str | None, Option(metavar="RECORDING", help=_REMOVE)] = None,
+    replace: Replace = False,
 ) -> None:
     """Make a map from photographs or videos without poses, by structure from motion; or add them to the map of CAPTURE.
 
@@ -502,16 +506,16 @@ def reconstruct(
     points: dict[str, Any] = {}
     option = ""
     if remove:
-        print("\n".join(remove_recording(remove, capture, device)))
-    elif (capture / "sessions" / f"{device}_map").exists():
+        print(remove_recording(remove, capture, device))
+    elif (capture / "sessions" / f"{device}_map").exists() and not replace:
         first = {"hold-out": hold_out, "camera": camera, "distance": distance, "positions": positions, "masks": masks}
         if given := next((name for name, value in first.items() if value), None):
             raise ManifestError(f"--{given} is for a new map. {capture} has one, to which the photographs are added.")
-        print("\n".join(add_recording(photos, capture, device, fps)))
+        print(add_recording(photos, capture, device, fps).text())
     else:
         result = reconstruct(
             photos, capture, device, fps, camera, distance, mapper, hold_out=hold_out, positions=positions,
-            placing=placing, masks=masks,
+            placing=placing, masks=masks, replace=replace,
         )  # fmt: skip
         print(result.report.text())
         points, option = {"points": result.points, "colors": result.colors}, result.camera

@@ -1,6 +1,7 @@
 """Artifacts on disk: written atomically, each with a record of its settings, inputs and checksums."""
 
 import csv
+import ctypes
 import errno
 import glob
 import hashlib
@@ -55,20 +56,50 @@ def write_atomic(path: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def write_folder(path: str | Path) -> Iterator[Path]:
-    """Yield a hidden folder, which is moved to `path` (missing or empty) if the block ends without an error.
+def write_folder(path: str | Path, replace: bool = False, keep: bool = False) -> Iterator[Path]:
+    """Yield a hidden folder, which is moved to `path` if the block ends without an error.
 
-    Remains of killed writers of the same folder are removed first.
+    Args:
+        replace: `path` may be a folder with files, which is replaced at once; else it must be missing or empty.
+        keep: the new folder starts with these files, as hard links: replace them rather than write into them.
     """
     path = Path(path)
-    for stale in path.parent.glob(f".{glob.escape(path.name)}.*-*"):
-        if is_left_over(stale.name):
-            shutil.rmtree(stale, ignore_errors=True)
+    recover_folder(path)
     with temporary_folder(path) as folder:
         content = folder / path.name
         content.mkdir()
+        if keep and path.is_dir():
+            shutil.copytree(path, content, symlinks=True, copy_function=link_or_copy, dirs_exist_ok=True)
         yield content
-        content.replace(path)
+        if replace and path.is_dir():
+            _exchange(content, path)
+        else:
+            content.replace(path)
+
+
+def recover_folder(path: Path) -> None:
+    """Remove remains of killed writers of a folder; a folder that one has moved away for a new one comes back."""
+    for stale in path.parent.glob(f".{glob.escape(path.name)}.*-*"):
+        if is_left_over(stale.name):
+            if (stale / _ASIDE).is_dir() and not path.exists():
+                (stale / _ASIDE).replace(path)
+            shutil.rmtree(stale, ignore_errors=True)
+
+
+_ASIDE = "old"
+
+
+def _exchange(new: Path, old: Path) -> None:
+    """Exchange two folders: at once by Linux's renameat2, where the file system has it; else the old one goes first."""
+    rename = getattr(ctypes.CDLL(None), "renameat2", None)
+    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE of linux/fs.h
+    if rename is None or rename(here, os.fsencode(new), here, os.fsencode(old), exchange) != 0:
+        aside = old.replace(new.with_name(_ASIDE))
+        try:
+            new.replace(old)
+        except BaseException:
+            aside.replace(old)
+            raise
 
 
 @contextmanager

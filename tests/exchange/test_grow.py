@@ -10,10 +10,10 @@ import PIL.Image
 import pycolmap
 import pytest
 
+from toolkit import files
 from toolkit.capture import Capture
 from toolkit.capture.check import check_capture
 from toolkit.errors import CaptureError
-from toolkit.exchange import grow
 from toolkit.exchange.grow import add_recording, remove_recording
 from toolkit.exchange.reconstruct import RECORD, reconstruct
 from toolkit.features.sift import SiftExtractor
@@ -59,9 +59,9 @@ def test_new_photographs_are_registered_and_the_others_stay(
         return extract(self, images)
 
     monkeypatch.setattr(SiftExtractor, "extract", count)
-    said = add_recording([folders / "more", folders / "foreign"], first)
-    assert said[0].startswith(f"2 of 3 photographs added to {session}, which has 6")
-    assert said[1].startswith("foreign/noise.png: no matches")
+    report = add_recording([folders / "more", folders / "foreign"], first)
+    assert (report.record["used"], report.record["before"]) == (2, 4)
+    assert report.images.set_index("image")["status"]["foreign/noise.png"].startswith("no matches")
     assert len(extracted) == 3
     assert all((session / name).read_text().startswith(before[name]) for name in TABLES)
     assert (read_json(session / RECORD)["photographs"], read_json(session / RECORD)["registered"]) == (7, 6)
@@ -81,10 +81,10 @@ def test_new_photographs_are_registered_and_the_others_stay(
         add_recording([folders / "more"], first)
     with pytest.raises(CaptureError, match=r"found 0 of 6 images of recording 'mor'\. Recordings: more"):
         remove_recording("mor", first)
-    assert remove_recording("more", first)[0].startswith("2 images of more removed")
+    assert remove_recording("more", first).startswith("2 images of more removed")
     assert {name: (session / name).read_text() for name in TABLES} == before
     assert not list((session / "raw_data").rglob("more/*"))
-    assert add_recording([folders / "more"], first)[0].startswith("2 of 2 photographs added")
+    assert add_recording([folders / "more"], first).record["used"] == 2
 
 
 def test_a_killed_addition_is_repeated(folders: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,21 +92,18 @@ def test_a_killed_addition_is_repeated(folders: Path, tmp_path: Path, monkeypatc
     reconstruct([folders / "first"], place)
     session = place / "sessions" / "ios_map"
     before = (session / "images.txt").read_text()
-    write = grow.write_table
 
-    def kill(path: Path, *rest: Any) -> None:
-        if path.name == "images.txt":
-            raise KeyboardInterrupt
-        write(path, *rest)
+    def kill(*_: Path) -> None:
+        raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(grow, "write_table", kill)
+        patch.setattr(files, "_exchange", kill)
         with pytest.raises(KeyboardInterrupt):
             add_recording([folders / "more"], place)
     assert (session / "images.txt").read_text() == before
     assert len(Capture.open(place)["ios_map"].images) == 4
     assert check_capture(place).ok
-    assert add_recording([folders / "more"], place)[0].startswith("2 of 2 photographs added")
+    assert add_recording([folders / "more"], place).record["used"] == 2
     assert np.isfinite(Capture.open(place)["ios_map"].world_from_cam()).all()
     assert check_capture(place).ok
 

@@ -115,4 +115,5 @@ def is_linked_here(session: Path) -> bool:
 
 def note_linked_here(session: Path) -> None:
     """Record in a session's folder that its links are the user's own."""
+    (session / LINKED_HERE).unlink(missing_ok=True)  # it may be a hard link to that of an older folder
     (session / LINKED_HERE).write_text(f"{session.stat().st_ino}\n", encoding="utf-8")

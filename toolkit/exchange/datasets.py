@@ -108,7 +108,7 @@ def import_dataset(
             draft.others.setdefault("not taken by --every", []).append(image.name)
             continue
         taken.append(image)
-        draft.add(image.name, image.camera, image.pose, f"given by {kind}", image.time_us)
+        draft.add_image(image.name, image.camera, image.pose, f"given by {kind}", image.time_us)
     draft.convention = f"as published by {kind}"
     without_split = not any(image.split for image in taken)
     held = every_nth([image.name for image in taken], draft.hold_out) if without_split else set()

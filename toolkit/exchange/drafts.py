@@ -5,6 +5,7 @@ of each image; `proc/import.json` has the table of the import (see `import_repor
 null if unknown. Images are not rotated: intrinsics belong to the stored pixels, whatever orientation EXIF states.
 """
 
+import dataclasses
 import json
 import os
 import re
@@ -14,7 +15,7 @@ import unicodedata
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, TypedDict, Unpack
 
@@ -23,7 +24,7 @@ import pandas as pd
 import PIL.Image
 import pycolmap
 
-from toolkit.capture import RAW_DATA, Trajectory, write_session
+from toolkit.capture import RAW_DATA, Session, Trajectory, write_session
 from toolkit.capture.cameras import camera_text, invertible_share
 from toolkit.capture.devices import SPLITS
 from toolkit.capture.folder import IMPORT_RECORD
@@ -38,12 +39,22 @@ from toolkit.capture.images import (
     time_taken,
     zone_of,
 )
-from toolkit.capture.names import EXPECTED_NAME, has_long_part, is_bad_name, note_linked_here
+from toolkit.capture.names import EXPECTED_NAME, has_long_part, is_bad_name, is_linked_here, note_linked_here
+from toolkit.capture.tables import write_table
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.georeference import alignment, gps_position, quarter_turns, read_positions
 from toolkit.exchange.import_report import ImportReport, cameras_of, grouped
-from toolkit.files import IMPORTED, MASKS, write_folder
+from toolkit.files import (
+    IMPORTED,
+    MASKS,
+    own_name,
+    read_json,
+    recover_folder,
+    write_atomic,
+    write_folder,
+    write_text,
+)
 from toolkit.geometry import Floats, make_pose
 from toolkit.manifest import nearest
 
@@ -90,6 +101,10 @@ class Options(TypedDict, total=False):
     """Move the world to x east, y north, z up, in meters, by the GPS in EXIF of at least three images."""
     positions: str | Path | None
     """The same by a CSV file with the columns image, x, y, z: camera centers, meters."""
+    replace: bool
+    """Replace a session that exists, at once."""
+    add: bool
+    """Add the images that a session lacks; what it has stays as it is."""
     record: dict[str, Any]
     """Further content of `proc/import.json`."""
 
@@ -132,6 +147,8 @@ class Draft:
     masks: str | Path | None = None
     gps: bool = False
     positions: str | Path | None = None
+    replace: bool = False
+    add: bool = False
     record: dict[str, Any] = field(default_factory=dict)
     images: list[DraftImage] = field(default_factory=list)
     rows: list[dict[str, Any]] = field(default_factory=list)  # rows of `proc/import.csv`
@@ -147,10 +164,12 @@ class Draft:
     mask_files: dict[str, Path] = field(default_factory=dict)  # those that are not in `masks` under their names
     given_times: int = 0  # images whose time is not from EXIF
     times_from: str = ""
+    before: int = 0  # images in the session that these are added to
+    old_times: frozenset[int] = frozenset()  # and their timestamps
     sensors: dict[str, str] = field(default_factory=dict)  # id by `camera_text`, for images that are not in a rig
     started: float = field(default_factory=time.perf_counter)
 
-    def add(
+    def add_image(
         self, name: str, camera: pycolmap.Camera | str, world_from_cam: Floats | str | None, origin: str,
         time_us: int | None = None,
     ) -> None:  # fmt: skip
@@ -186,6 +205,7 @@ class Draft:
         listed = {_composed(name) for name in self._names()}
         drafts = [self, self._split(held)] if held else [self]
         for draft in drafts:
+            draft.follow()
             draft.leave_out()
         if self.listed_in:
             listed |= {_composed(name) for draft in drafts for name in draft._names()}
@@ -266,13 +286,49 @@ class Draft:
 
     def _split(self, held: Collection[str]) -> "Draft":
         """Move some frames to the draft of a query session."""
-        queries = replace(self, session=_session(self.session.parents[1], self.session.name[: -len("_map")], "query"))
+        capture, device = self.session.parents[1], self.session.name.removesuffix("_map")
+        queries = dataclasses.replace(self, session=_session(capture, device, "query", self.replace or self.add))
         for draft, is_query in ((self, False), (queries, True)):
             draft.images = [image for image in draft.images if (image.frame in held) == is_query]
             draft.poses = {frame: pose for frame, pose in draft.poses.items() if (frame in held) == is_query}
             draft.rows = [row for row in draft.rows if (row["image"] in held) == is_query]
         queries.notes, queries.others = [], {}
         return queries
+
+    def follow(self) -> None:
+        """Fit the images to the session that they are added to: leave out what it has; give sensors and rigs new ids.
+
+        Raises:
+            CaptureError: it has another unit, or all the images.
+        """
+        if not (self.add and self.session.is_dir()):
+            return
+        old = Session.open(self.session)
+        known, unit = set(map(own_name, old.image_names)), read_json(self.session / IMPORT_RECORD).get("unit", "m")
+        if unit != self.record.setdefault("unit", unit) and self.poses:
+            found, expected = self.record["unit"] or "unknown", unit or "unknown"
+            raise CaptureError(f"{self.session}: the unit of its poses is {expected}, that of the new ones {found}.")
+        names = [image.name for image in self.images if {image.name, f"{image.name}.png"} & known]
+        self.others |= {"in the session already": names} if names else {}
+        self.images = [image for image in self.images if image.name not in set(names)]
+        if not self.images:
+            raise CaptureError(f"{self.session}: has all {len(names)} images already, so there is none to add.")
+        if not is_linked_here(self.session):  # links of others do not become the user's own
+            self.placing = "copy"
+        self.before, self.old_times = len(known), frozenset(old.images["timestamp"].tolist())
+        in_rigs = set() if old.rigs is None else set(old.rigs["sensor_id"]) | set(old.rigs["rig_id"])
+        ids = list(old.sensors["sensor_id"][old.sensors["sensor_type"] == "camera"])
+        new_id = {camera_text(old.camera(sensor)): sensor for sensor in ids if sensor not in in_rigs}
+        number, taken = len(old.sensors), in_rigs | set(ids)
+        for image in self.images:
+            for kind, key in (("cam", image.sensor if image.rig else camera_text(image.camera)), ("rig", image.rig)):
+                while key is not None and key not in new_id:
+                    number += 1
+                    if (name := f"{SUBSESSION}/{kind}_{number}") not in taken:
+                        new_id[key] = name
+            image.sensor = new_id[image.sensor if image.rig else camera_text(image.camera)]
+            image.rig = None if image.rig is None else new_id[image.rig]
+        self.rigs = [(new_id.get(rig, rig), new_id.get(sensor, sensor), pose) for rig, sensor, pose in self.rigs]
 
     def source(self, name: str) -> Path:
         """Return the file of an image."""
@@ -385,7 +441,7 @@ class Draft:
             "masks": [len(masks), "no features where they are black"] if masks else None, "notes": self.notes,
         } | self.record  # fmt: skip
         record["up"] = f"z, {record['up']}" if "up" in record else f"({up}), as most cameras are held"
-        with write_folder(self.session) as session:
+        with write_folder(self.session, self.replace or self.add, keep=self.add) as session:
             files = [(self.source(image.name), session / RAW_DATA / image.path) for image in self.images]
             files += [(path, session / MASKS / f"{IMPORTED}{name}.png") for name, path in masks.items()]
             for source, target in files:
@@ -396,12 +452,19 @@ class Draft:
                     shutil.copyfile(source, target)
                 else:
                     target.symlink_to(os.path.abspath(source))  # noqa: PTH100 - must not resolve links in the source
-            self._write_tables(session, times)
-            table.to_csv(session / "proc" / "import.csv", index=False)
+            made = session / "new" if self.before else session
+            self._write_tables(made, times)
+            listed = table
+            if self.before:
+                _append(made, session)
+                listed = pd.concat([_read_rows(session), table]).drop_duplicates("image", keep="last")
+                record = read_json(session / IMPORT_RECORD) | record | {"before": self.before}
+            with write_atomic(session / "proc" / "import.csv") as temporary:
+                listed.to_csv(temporary, index=False)
             if self.placing == "link":
                 note_linked_here(session)
             record["seconds"] = round(time.perf_counter() - self.started, 3)
-            (session / IMPORT_RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+            write_text(session / IMPORT_RECORD, json.dumps(record, indent=1) + "\n")
         return ImportReport(self.session, table, record)
 
     def _write_tables(self, session: Path, times: Mapping[str, int]) -> None:
@@ -471,7 +534,7 @@ class Draft:
         in_zones = len(zones) == len(frames) and len(set(zones.values())) > 1  # a journey, or daylight saving ended
         if in_zones:
             taken = {frame: time - zones[frame] for frame, time in taken.items()}
-        if len(taken) == len(frames) == len(set(taken.values())):
+        if len(taken) == len(frames) == len(set(taken.values())) and self.old_times.isdisjoint(taken.values()):
             zone = ", in UTC, as its time zone changes" if in_zones else ""
             if zones and len(zones) < len(frames):
                 zone = "; only some images have a time zone, which is ignored"
@@ -479,12 +542,16 @@ class Draft:
             return taken
         why = f"some images have {'no' if len(taken) < len(frames) else 'the same'} time in EXIF"
         self.times_from = f"made up, one second apart in the order of the images ({why})"
-        return {frame: (number + 1) * 10**6 for number, frame in enumerate(frames)}
+        first = max(self.old_times, default=0) // 10**6 + 1
+        return {frame: (number + first) * 10**6 for number, frame in enumerate(frames)}
 
 
 def start(capture: str | Path, device: str, split: str, folder: Path, **options: Unpack[Options]) -> Draft:
     """Return the draft of a new session. Raise CaptureError if it exists, ManifestError for an invalid argument."""
-    draft = Draft(_session(Path(capture), device, split), folder, **options)
+    may_exist = options.get("replace", False) or options.get("add", False)
+    draft = Draft(_session(Path(capture), device, split, may_exist), folder, **options)
+    if draft.add and (draft.replace or draft.gps):
+        raise ManifestError(f"add: found together with {'replace' if draft.replace else 'gps'}. Give one of them.")
     if draft.placing not in PLACING:
         raise ManifestError(f"images: unknown choice {draft.placing!r}. {nearest(draft.placing, PLACING)}")
     if draft.axes not in AXES:
@@ -494,12 +561,12 @@ def start(capture: str | Path, device: str, split: str, folder: Path, **options:
     if draft.hold_out and (draft.hold_out < 2 or split != "map"):
         raise ManifestError(f"hold-out: found {draft.hold_out} for a {split}, expected 2 or more, for a map.")
     if draft.hold_out:
-        _session(Path(capture), device, "query")
+        _session(Path(capture), device, "query", may_exist)
     return draft
 
 
-def _session(capture: Path, device: str, split: str) -> Path:
-    """Return the folder of a new session. Raise CaptureError if it exists, ManifestError if its name is invalid."""
+def _session(capture: Path, device: str, split: str, may_exist: bool) -> Path:
+    """Return the folder of a session. Raise CaptureError if it must not exist, ManifestError if its name is invalid."""
     if split not in SPLITS:
         raise ManifestError(f"split: unknown {split!r}. {nearest(split, SPLITS)}")
     if not re.fullmatch(r"[a-z0-9-]+", device):  # the rule for `extra_devices` in a manifest
@@ -507,9 +574,27 @@ def _session(capture: Path, device: str, split: str) -> Path:
     session = capture / "sessions" / f"{device}_{split}"
     if has_long_part(session.name, "session"):
         raise ManifestError(f"device: found {device!r}, expected fewer letters: a session's name has 40 bytes at most.")
-    if session.exists():
-        raise CaptureError(f"{session} exists already. Import into another capture or device, or remove it first.")
+    recover_folder(session)
+    if session.exists() and not may_exist:
+        do = "Give --replace to make it again, --add to add what it lacks, or another device or capture."
+        raise CaptureError(f"{session} exists already. {do}")
     return session
+
+
+def _append(made: Path, session: Path) -> None:
+    """Append the new lines of a folder's tables to those of a session, and remove the folder."""
+    for path in sorted(made.rglob("*.txt")):
+        target = session / path.relative_to(made)
+        old = target.read_text(encoding="utf-8").splitlines() if target.exists() else []
+        known = set(old)
+        added = [line for line in path.read_text(encoding="utf-8").splitlines() if line not in known]
+        write_table(target, None, [*old, *(line for line in added if not (old and line.startswith("#")))])
+    shutil.rmtree(made)
+
+
+def _read_rows(session: Path) -> pd.DataFrame:
+    path = session / "proc" / "import.csv"
+    return pd.read_csv(path, dtype=str, keep_default_na=False) if path.exists() else pd.DataFrame({"image": []})
 
 
 def every_nth(frames: Sequence[str], number: int) -> set[str]:

@@ -6,7 +6,7 @@ given; its name is the first part of the names of its images.
 
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 
@@ -16,28 +16,28 @@ import pycolmap
 from tqdm.auto import tqdm
 
 from toolkit.capture import Session
-from toolkit.capture.cameras import camera_text
 from toolkit.capture.images import exif_key, read_header
-from toolkit.capture.names import LINKED_HERE
+from toolkit.capture.names import is_linked_here, note_linked_here
 from toolkit.capture.session import RAW_DATA
 from toolkit.capture.tables import write_table
 from toolkit.errors import CaptureError
-from toolkit.exchange.drafts import SUBSESSION
+from toolkit.exchange.drafts import Draft, DraftImage
+from toolkit.exchange.import_report import ImportReport
 from toolkit.exchange.photographs import Photograph, gather, initial_cameras
 from toolkit.exchange.reconstruct import FOLDER, RATIO, RECORD, _hand_over, _Mutual, _quiet, _reasons, _Work
 from toolkit.features.features import KINDS
 from toolkit.features.matching import LocalMethod
 from toolkit.features.sift import SiftExtractor
-from toolkit.files import IMPORTED, MASKS, own_name, read_json, write_text
-from toolkit.geometry import Ints, make_pose, qt_from_pose
+from toolkit.files import IMPORTED, MASKS, own_name, read_json, write_atomic, write_folder, write_text
+from toolkit.geometry import Ints, make_pose
 from toolkit.store.items import heals
 
 
 @heals
 def add_recording(
     sources: Sequence[str | Path], capture: str | Path, device: str = "ios", fps: float | None = None
-) -> list[str]:
-    """Register photographs into the model of a capture and add them to its map session; return what was done, in words.
+) -> ImportReport:
+    """Register photographs into the model of a capture and add them to its map session.
 
     Args:
         sources, capture, device, fps: as for `reconstruct`; the map session was made by it.
@@ -67,15 +67,13 @@ def add_recording(
     if not added:
         raise CaptureError(f"{sources[0]}: no photograph fits into the model. {next(iter(reasons.items()))}.")
     item_of = dict(zip(work.names, work.photographs, strict=True))
-    _append(session, sorted(added, key=lambda image: image.image_id), item_of, reasons)
+    report = _append(session, sorted(added, key=lambda image: image.image_id), item_of, reasons)
     _finish(folder, session, model)
     _hand_over(work, session)
-    lines = [f"{len(added)} of {len(new) + len(unreadable)} photographs added to {session}, which has "
-             f"{model.num_reg_images()} in its model; their poses are as they were"]  # fmt: skip
-    return lines + [f"{name}: {why}" for name, why in list(reasons.items())[:20]]
+    return report
 
 
-def remove_recording(name: str, capture: str | Path, device: str = "ios") -> list[str]:
+def remove_recording(name: str, capture: str | Path, device: str = "ios") -> str:
     """Remove the images whose names start with a recording's name from the map session; return what was done, in words.
 
     Raises:
@@ -90,16 +88,20 @@ def remove_recording(name: str, capture: str | Path, device: str = "ios") -> lis
         raise CaptureError(f"{session}: found {found}. Recordings: {', '.join(recordings) or 'one, without a name'}.")
     keys = {(str(row["timestamp"]), row["sensor_id"]) for row, one in
             zip(opened.images.to_dict("records"), opened.image_names, strict=True) if one in gone}  # fmt: skip
-    _rewrite(session / "images.txt", lambda cells: (cells[0], cells[1]) not in keys)
-    _rewrite(session / "trajectories.txt", lambda cells: (cells[0], cells[1]) not in keys)
+    with write_folder(session, replace=True, keep=True) as changed:
+        for file in ("images.txt", "trajectories.txt"):
+            _rewrite(changed / file, lambda cells: (cells[0], cells[1]) not in keys)
+        for one in gone:
+            (changed / RAW_DATA / one.partition(f"/{RAW_DATA}/")[2]).unlink(missing_ok=True)
+        table = pd.read_csv(changed / "proc" / "import.csv", dtype=str, keep_default_na=False)
+        with write_atomic(changed / "proc" / "import.csv") as temporary:
+            table[~table["image"].str.startswith(f"{name}/")].to_csv(temporary, index=False)
+        if is_linked_here(session):
+            note_linked_here(changed)
     for image in [image for image in model.images.values() if image.name in gone and image.has_pose]:
         model.deregister_frame(image.frame_id)
-    for one in gone:
-        (session / RAW_DATA / one.partition(f"/{RAW_DATA}/")[2]).unlink(missing_ok=True)
-    table = pd.read_csv(session / "proc" / "import.csv", dtype=str, keep_default_na=False)
-    table[~table["image"].str.startswith(f"{name}/")].to_csv(session / "proc" / "import.csv", index=False)
     _finish(folder, session, model)
-    return [f"{len(gone)} images of {name} removed from {session}, which has {len(opened.image_names) - len(gone)} now"]
+    return f"{len(gone)} images of {name} removed from {session}, which has {len(opened.image_names) - len(gone)} now"
 
 
 def _model(folder: Path, session: Path) -> pycolmap.Reconstruction:
@@ -189,55 +191,31 @@ def _register(work: _Work, base: pycolmap.Reconstruction, fixed: set[int]) -> py
 
 
 def _append(
-    session: Path, added: list[pycolmap.Image], item_of: dict[str, Photograph], reasons: dict[str, str]
-) -> None:
-    """Add images to the files of a session; its list of images last, so that a killed command leaves a session."""
-    opened = Session.open(session)
-    first = int(opened.images["timestamp"].max()) // 10**6 + 1
-    taken = {str(name) for name in opened.sensors["sensor_id"]}
-    number, sensors = len(taken) + 1, dict[int, str]()
-    rows: dict[str, list[str]] = {"sensors.txt": [], "trajectories.txt": [], "images.txt": []}
-    table = pd.read_csv(session / "proc" / "import.csv", dtype=str, keep_default_na=False)
-    listed = [{"image": name, "status": why} for name, why in reasons.items()]
-    for step, image in enumerate(added):
-        item, time_us, camera = item_of[image.name], (first + step) * 10**6, image.camera
-        assert camera is not None
-        if image.camera_id not in sensors:
-            sensors[image.camera_id] = f"{SUBSESSION}/cam_{number}"
-            number += 1
-            rows["sensors.txt"].append(f"{sensors[image.camera_id]}, , camera, {camera_text(camera)}")
-        sensor, path = sensors[image.camera_id], f"{IMPORTED}{item.name}"
-        target = session / RAW_DATA / path
-        _place(session, item.path, target)
+    session: Path, added: Sequence[pycolmap.Image], item_of: Mapping[str, Photograph], reasons: Mapping[str, str]
+) -> ImportReport:
+    """Add images of the model to a session."""
+    draft = Draft(session, session.parents[1] / FOLDER, add=True, convention="found in the model")
+    for image in added:
+        item, pose = item_of[image.name], image.cam_from_world().inverse()
+        assert image.camera is not None
+        draft.images.append(
+            DraftImage(item.name, image.camera, f"{image.camera_id}", item.name, origin="estimated with the model")
+        )
+        draft.poses[item.name] = make_pose(pose.rotation.matrix(), pose.translation)
+        draft.sources[item.name] = item.path
         if item.mask is not None:
-            _place(session, item.mask, session / MASKS / f"{path}.png")
-        pose = image.cam_from_world().inverse()
-        values = qt_from_pose(make_pose(pose.rotation.matrix(), pose.translation)).tolist()
-        rows["trajectories.txt"].append(", ".join([str(time_us), sensor, *map(repr, values)]))
-        rows["images.txt"].append(f"{time_us}, {sensor}, {path}")
-        listed.append({"image": item.name, "status": "imported", "path": path, "timestamp": str(time_us),
-                       "sensor_id": sensor, "device_id": sensor, "camera": camera_text(camera)})  # fmt: skip
-    for name, lines in rows.items():  # a killed command may have left poses without images
-        _rewrite(session / name, lambda cells: not cells[0].isdigit() or int(cells[0]) < first * 10**6, lines)
-    table = pd.concat([table, pd.DataFrame(listed)])
-    table.drop_duplicates("image", keep="last").to_csv(session / "proc" / "import.csv", index=False)
+            draft.mask_files[item.name] = item.mask
+    draft.rows = [{"image": name, "status": why} for name, why in reasons.items()]
+    draft.follow()
+    draft.leave_out()
+    return draft.write()
 
 
-def _place(session: Path, source: Path, target: Path) -> None:
-    """Link to a file or copy it, as the other files of the session were placed."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.unlink(missing_ok=True)
-    if (session / LINKED_HERE).is_file():
-        target.symlink_to(source.absolute())
-    else:
-        shutil.copyfile(source, target)
-
-
-def _rewrite(path: Path, keep: Callable[[list[str]], bool], added: Sequence[str] = ()) -> None:
-    """Write the lines of a table again that a function of their cells keeps, and further lines."""
+def _rewrite(path: Path, keep: Callable[[list[str]], bool]) -> None:
+    """Write the lines of a table again that a function of their cells keeps."""
     lines = path.read_text(encoding="utf-8").splitlines()
     kept = [line for line in lines if line.startswith("#") or keep([cell.strip() for cell in line.split(",")])]
-    write_table(path, None, [*kept, *added])
+    write_table(path, None, kept)
 
 
 def _finish(folder: Path, session: Path, model: pycolmap.Reconstruction) -> None:

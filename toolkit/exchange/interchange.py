@@ -181,7 +181,7 @@ def import_images(
             image_camera, origin = _camera_of(row, listed_cameras, shared_camera, folder / name, where)
         except (ImageError, CaptureError) as error:
             image_camera, origin = str(error), ""
-        draft.add(name, image_camera, poses.get(name), origin)
+        draft.add_image(name, image_camera, poses.get(name), origin)
     if truth is not None:
         draft.notes.append(f"ground truth of {len(draft.poses)} of {len(rows)} images: {truth}")
     return draft.finish()

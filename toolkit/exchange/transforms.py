@@ -84,9 +84,9 @@ def import_transforms(
             world_from_named = frame.world_from_named()
             if undo_applied:
                 world_from_named = _undone(world_from_named, *applied)
-            draft.add(name, frame.camera(), world_from_named, f"given by {path.name}")
+            draft.add_image(name, frame.camera(), world_from_named, f"given by {path.name}")
         except (ImageError, CaptureError) as error:
-            draft.add(name, str(error), None, "")
+            draft.add_image(name, str(error), None, "")
     draft.listed_in, draft.beside = path.name, True
     if own_split:
         draft.notes.append("map and queries: train_filenames, and val_filenames and test_filenames of the file")
