@@ -69,6 +69,8 @@ MatchNames = Annotated[
 ]
 Gps = Annotated[bool, Option("--gps", help="Move the world to x east, y north, z up, in meters, by GPS in EXIF.")]
 Positions = Annotated[Path | None, Option(help="CSV: image,x,y,z, known camera centers in meters.")]
+_TIMES = "Times of the images: the last numbers in their names, or a file with time and name in each line."
+_FIXES = "GPS: CSV with image or timestamp, latitude, longitude, altitude, accuracy; or exif."
 _APPLIED = "Undo applied_transform and applied_scale, by which nerfstudio has changed the world of its input."
 _NAMES = "Name imported images as in your folder (own), or as in the capture (capture)."
 Names = Annotated[str, Option("--names", metavar="own|capture|file", help=_NAMES)]
@@ -356,6 +358,12 @@ def _shared(
     masks: Masks = None,
     gps: Gps = False,
     positions: Positions = None,
+    timestamps: Annotated[Path | None, Option(metavar="names|FILE", help=_TIMES)] = None,
+    timestamps_unit: Annotated[str | None, Option(metavar="s|ms|us|ns", help="Of times that are given.")] = None,
+    odometry: Annotated[Path | None, Option(help="The queries' own poses: TUM, EuRoC, KITTI, ARKit.")] = None,
+    depth: Annotated[Path | None, Option(metavar="DIR", help="Depth maps: PNG, 16 bits, millimeters.")] = None,
+    depth_camera: Annotated[str | None, Option(metavar="'MODEL, W, H, ...'", help="If it is not the image's.")] = None,
+    fixes: Annotated[Path | None, Option(metavar="exif|FILE", help=_FIXES)] = None,
     replace: Replace = False,
     add: Annotated[bool, Option("--add", help="Add the images that the session lacks; the others stay.")] = False,
     as_json: ReportJson = False,

@@ -320,16 +320,6 @@ def test_a_table_in_utf16_is_read(folder: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(poses_of(Capture.open(tmp_path / "PLACE")["ios_map"])["a/2.jpg"], pose(0), atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("line", "name"), [("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "KITTI"), ("# time\n1305.1 1 2 3 0 0 0 1\n" * 3, "TUM")]
-)
-def test_lists_of_poses_without_names_are_recognized(line: str, name: str, folder: Path, tmp_path: Path) -> None:
-    table = tmp_path / "poses.txt"
-    table.write_text(line)
-    with pytest.raises(CaptureError, match=rf"poses\.txt: looks like {name}"):
-        import_images(folder, tmp_path / "PLACE", split="map", table=table, camera=CAMERA)
-
-
 def test_the_unit_and_the_axes_of_a_model(model: Path, tmp_path: Path) -> None:
     report = import_colmap(model, tmp_path / "photos", tmp_path / "A", device="hl")
     assert "unknown: relative to the depth of the scene" in report.text()

@@ -20,6 +20,7 @@ from toolkit.capture.tables import ALIGNED, COLUMNS, POSE_NAMES, SIGNALS, KeyInd
 from toolkit.capture.world_up import estimate_world_up, posed_photographs
 from toolkit.capture.writing import read_depth
 from toolkit.errors import CaptureError, ImageError
+from toolkit.files import read_json
 from toolkit.geometry import unit
 
 ERROR, WARNING = "error", "warning"
@@ -245,9 +246,14 @@ class _SessionCheck:
             else:
                 self.sizes[sensor] = verdict
 
+    @property
+    def _has_given_times(self) -> bool:
+        made = read_json(self.session.path / IMPORT_RECORD).get("timestamps")
+        return isinstance(made, list) and "as given" in made
+
     def _check_steps(self) -> None:
-        """Report times that seem to have another unit than microseconds; those of imports are from EXIF."""
-        if (self.session.path / IMPORT_RECORD).is_file():
+        """Report times that seem to have another unit than microseconds; those that imports made are from EXIF."""
+        if (self.session.path / IMPORT_RECORD).is_file() and not self._has_given_times:
             return
         frames = self.session.images[["timestamp"]].assign(subsession=self.session.subsession_of())
         steps = [np.diff(np.unique(times_of(one))) for _, one in frames.groupby("subsession")]

@@ -8,7 +8,7 @@ TUM RGB-D (J. Sturm et al., IROS 2012), KITTI odometry (A. Geiger et al., CVPR 2
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Unpack
@@ -23,13 +23,12 @@ from toolkit.exchange.colmap_model import ColmapModel, inverse, read_model
 from toolkit.exchange.drafts import Options, every_nth, start
 from toolkit.exchange.import_report import ImportReport
 from toolkit.exchange.interchange import camera_at
+from toolkit.exchange.recordings import MAX_OFFSET_S, lines_of, numbers_of, read_track
 from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
 from toolkit.manifest import nearest
 
 HOLD_OUT = 8
 """Every such photograph becomes a query, in data sets without a split."""
-MAX_OFFSET_S = 0.02
-"""Largest time between a photograph and the pose that is taken for it, seconds."""
 _SEVEN_SCENES = (525.0, 525.0, 320.0, 240.0)  # of the color camera, as usual for this data set; none is published
 _TWELVE_SCENES = (572.0, 572.0, 320.0, 240.0)  # at 640 x 480, where a scene has no info.txt
 _TUM = {
@@ -118,31 +117,10 @@ def import_dataset(
 # Reading
 
 
-def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Return place and words of the lines of a text file that are neither empty nor comments."""
-    try:
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        raise CaptureError(f"{path}: cannot be read ({error.strerror}). It is part of the data set.") from None
-    for number, line in enumerate(text.splitlines(), start=1):
-        if line.strip() and not line.startswith("#"):
-            yield f"{path}, line {number}", line.replace(",", " ").split()
-
-
-def _numbers(where: str, words: Sequence[str], count: int) -> Floats:
-    try:
-        values = np.array([float(word) for word in words[:count]])
-        if len(values) == count:
-            return values
-    except ValueError:
-        pass
-    raise CaptureError(f"{where}: found {' '.join(words)[:80]!r}, expected {count} numbers.")
-
-
 def _matrix(path: Path) -> Floats | str:
     """Return a pose (4, 4) from a file of four lines, or why there is none: tracking was lost."""
     try:
-        rows = np.array([_numbers(where, words, 4) for where, words in _lines(path)])
+        rows = np.array([numbers_of(where, words, 4) for where, words in lines_of(path)])
     except CaptureError as error:
         return str(error)
     is_pose = rows.shape == (4, 4) and np.isfinite(rows).all()
@@ -156,14 +134,17 @@ def _size(path: Path) -> tuple[int, int] | str:
         return str(error)
 
 
-def _nearest_pose(times_s: Floats, poses: Floats, time_s: float) -> Floats | str:
-    """Return the pose of the sorted `times_s` that is nearest to a time."""
-    at = int(np.searchsorted(times_s, time_s))
-    near = [k for k in (at - 1, at) if 0 <= k < len(times_s)]
-    best = min(near, key=lambda k: abs(times_s[k] - time_s), default=None)
-    if best is None or abs(times_s[best] - time_s) > MAX_OFFSET_S:
-        return f"no true pose within {MAX_OFFSET_S:g} s"
-    return np.asarray(poses[best])
+def _nearest_pose(path: Path, unit: str) -> Callable[[int], Floats | str]:
+    """Return a function that returns the pose of a list that is nearest to a time, microseconds."""
+    track = read_track(path, unit)
+    if track is None:
+        raise CaptureError(f"{path}: no list of poses over time. It is part of the data set.")
+
+    def at(time_us: int) -> Floats | str:
+        row = track.nearest(time_us)
+        return f"no true pose within {MAX_OFFSET_S:g} s" if row is None else np.asarray(track.poses[row])
+
+    return at
 
 
 def _first(paths: Iterable[Path], folder: Path, expected: str) -> Path:
@@ -180,7 +161,7 @@ def _seven_scenes(folder: Path) -> tuple[Path, list[Photograph]]:
     camera = camera_at(folder, ", ".join(map(str, ("PINHOLE", 640, 480, *_SEVEN_SCENES))))
     images = []
     for file, split in (("TrainSplit.txt", "map"), ("TestSplit.txt", "query")):
-        for where, (word, *_) in _lines(folder / file):
+        for where, (word, *_) in lines_of(folder / file):
             number = re.search(r"\d+$", word)
             if number is None:
                 raise CaptureError(f"{where}: found {word!r}, expected a sequence, such as sequence1.")
@@ -205,12 +186,12 @@ def _twelve_scenes(folder: Path) -> tuple[Path, list[Photograph]]:
     if isinstance(size, str):
         raise CaptureError(f"{first}: {size}.")
     fx, fy, cx, cy = np.array(_TWELVE_SCENES) * size[0] / 640
-    for where, words in _lines(folder / "info.txt") if (folder / "info.txt").is_file() else ():
+    for where, words in lines_of(folder / "info.txt") if (folder / "info.txt").is_file() else ():
         if words[0] == "m_calibrationColorIntrinsic":
-            fx, _, cx, _, _, fy, cy = _numbers(where, words[2:], 7)
+            fx, _, cx, _, _, fy, cy = numbers_of(where, words[2:], 7)
     camera = camera_at(folder / "info.txt", f"PINHOLE, {size[0]}, {size[1]}, {fx}, {fy}, {cx}, {cy}")
     # The first sequence is for tests: `sequence0 [frames=357]  [start=0 ; end=356]`.
-    ranges = [words for _, words in _lines(folder / "split.txt") if words[0].startswith("sequence")]
+    ranges = [words for _, words in lines_of(folder / "split.txt") if words[0].startswith("sequence")]
     found = re.search(r"start\s*=\s*(\d+).*?end\s*=\s*(\d+)", " ".join(ranges[0])) if ranges else None
     if found is None:
         raise CaptureError(f"{folder / 'split.txt'}: expected `sequence0 ... [start=0 ; end=356]`.")
@@ -229,17 +210,17 @@ def _cambridge(folder: Path) -> tuple[Path, list[Photograph]]:
     """
     focals = dict[str, float]()
     if (folder / "reconstruction.nvm").is_file():
-        for _, words in _lines(folder / "reconstruction.nvm"):
+        for _, words in lines_of(folder / "reconstruction.nvm"):
             if len(words) == 11:
                 focals[Path(words[0]).with_suffix("").as_posix()] = float(words[1])
             elif len(words) == 1 and focals:
                 break  # points follow
     usual, images = float(np.median([*focals.values()])) if focals else np.nan, list[Photograph]()
     for file, split in (("dataset_train.txt", "map"), ("dataset_test.txt", "query")):
-        for where, (name, *words) in _lines(folder / file):
+        for where, (name, *words) in lines_of(folder / file):
             if len(words) != 7 or not re.search(r"\.\w+$", name):
                 continue  # the header
-            center, quaternion = np.split(_numbers(where, words, 7), [3])
+            center, quaternion = np.split(numbers_of(where, words, 7), [3])
             rotation = pose_from_qt([*quaternion / np.linalg.norm(quaternion), 0, 0, 0])[:3, :3].T
             camera: pycolmap.Camera | str
             size = _size(folder / name)
@@ -260,7 +241,7 @@ def _aachen(folder: Path) -> tuple[Path, list[Photograph]]:
     root = _first(filter(Path.is_dir, choices), folder, "images_upright")
     images = _of_model(model, "map")
     for path in sorted(folder.glob("queries/*_with_intrinsics.txt")):
-        for where, (name, *words) in _lines(path):
+        for where, (name, *words) in lines_of(path):
             images.append(Photograph(name, "query", camera_at(where, ", ".join(words)), None))
     return root, images
 
@@ -285,27 +266,24 @@ def _tum(folder: Path) -> tuple[Path, list[Photograph]]:
         expected = f"a name with {', '.join(_TUM)}, which tells the camera"
         raise CaptureError.at(folder, folder.name, expected, "Name it as published.")
     camera = camera_at(folder, _TUM[kind])
-    rows = np.array([_numbers(where, words, 8) for where, words in _lines(folder / "groundtruth.txt")])
-    rows = rows[np.argsort(rows[:, 0])]
-    poses = pose_from_qt(rows[:, [7, 4, 5, 6, 1, 2, 3]])
-    images = []
-    for where, words in _lines(folder / "rgb.txt"):
-        time_s = float(_numbers(where, words, 1)[0])
-        pose = _nearest_pose(rows[:, 0], poses, time_s)
-        images.append(Photograph(words[1], "", camera, pose, round(time_s * 1e6)))
+    pose_at, images = _nearest_pose(folder / "groundtruth.txt", "s"), []
+    for where, words in lines_of(folder / "rgb.txt"):
+        time_us = round(float(numbers_of(where, words, 1)[0]) * 1e6)
+        images.append(Photograph(words[1], "", camera, pose_at(time_us), time_us))
     return folder, images
 
 
 def _kitti(folder: Path) -> tuple[Path, list[Photograph]]:
     """Read a sequence, `sequences/<NN>`, with its poses in `poses/<NN>.txt`: world_from_cam of the left gray camera."""
     truth = folder.parents[1] / "poses" / f"{folder.resolve().name}.txt"
-    poses = [_numbers(where, words, 12).reshape(3, 4) for where, words in _lines(truth)]
-    times = [float(words[0]) for _, words in _lines(folder / "times.txt")]
+    track = read_track(truth, "s")
+    poses = np.zeros((0, 4, 4)) if track is None else track.poses
+    times = [float(words[0]) for _, words in lines_of(folder / "times.txt")]
     number = 2 if (folder / "image_2").is_dir() else 0  # left color, or left gray
-    projections = {words[0].rstrip(":"): (where, words[1:]) for where, words in _lines(folder / "calib.txt")}
+    projections = {words[0].rstrip(":"): (where, words[1:]) for where, words in lines_of(folder / "calib.txt")}
     if f"P{number}" not in projections:
         raise CaptureError(f"{folder / 'calib.txt'}: expected a line P{number}: and 12 numbers.")
-    projection = _numbers(*projections[f"P{number}"], 12).reshape(3, 4)
+    projection = numbers_of(*projections[f"P{number}"], 12).reshape(3, 4)
     cam_from_gray = make_pose(np.eye(3), np.linalg.solve(projection[:, :3], projection[:, 3]))
     files = sorted((folder / f"image_{number}").glob("*.png"))
     size = _size(files[0]) if files else "no image"
@@ -317,7 +295,7 @@ def _kitti(folder: Path) -> tuple[Path, list[Photograph]]:
     for file in files:
         row = int(file.stem)
         known = row < min(len(poses), len(times))
-        pose = make_pose(poses[row][:, :3], poses[row][:, 3]) @ invert(cam_from_gray) if known else f"not in {truth}"
+        pose = poses[row] @ invert(cam_from_gray) if known else f"not in {truth}"
         name, time_us = file.relative_to(folder).as_posix(), round(times[row] * 1e6) if known else None
         images.append(Photograph(name, "", camera, pose, time_us))
     return folder, images
@@ -335,15 +313,12 @@ def _euroc(folder: Path) -> tuple[Path, list[Photograph]]:
         raise CaptureError(f"{cam0 / 'sensor.yaml'}: cannot be read ({error}). Expected {keys}.") from None
     camera = camera_at(cam0 / "sensor.yaml", ", ".join(map(str, ("OPENCV", *values))))
     truth = folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
-    rows = [(int(words[0]), _numbers(where, words[1:], 7)) for where, words in _lines(truth)]
-    times_s = np.array([time_ns / 1e9 for time_ns, _ in rows])
-    states = np.array([state for _, state in rows]).reshape(-1, 7)
-    poses = pose_from_qt(states[:, [3, 4, 5, 6, 0, 1, 2]]) @ body_from_cam
-    images = []
-    for _, words in _lines(cam0 / "data.csv"):
-        time_ns = int(words[0])
-        pose = _nearest_pose(times_s, poses, time_ns / 1e9)
-        images.append(Photograph(f"data/{words[1]}", "", camera, pose, time_ns // 1000))
+    body_at, images = _nearest_pose(truth, "ns"), []
+    for _, words in lines_of(cam0 / "data.csv"):
+        time_us = int(words[0]) // 1000
+        body = body_at(time_us)
+        pose = body if isinstance(body, str) else body @ body_from_cam
+        images.append(Photograph(f"data/{words[1]}", "", camera, pose, time_us))
     return cam0, images
 
 

@@ -13,7 +13,7 @@ import shutil
 import time
 import unicodedata
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -24,7 +24,7 @@ import pandas as pd
 import PIL.Image
 import pycolmap
 
-from toolkit.capture import RAW_DATA, Session, Trajectory, write_session
+from toolkit.capture import RAW_DATA, Session, Trajectory, parse_camera, write_session
 from toolkit.capture.cameras import camera_text, invertible_share
 from toolkit.capture.devices import SPLITS
 from toolkit.capture.folder import IMPORT_RECORD
@@ -40,11 +40,12 @@ from toolkit.capture.images import (
     zone_of,
 )
 from toolkit.capture.names import EXPECTED_NAME, has_long_part, is_bad_name, is_linked_here, note_linked_here
-from toolkit.capture.tables import write_table
+from toolkit.capture.tables import COLUMNS, write_table
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.georeference import alignment, gps_position, quarter_turns, read_positions
 from toolkit.exchange.import_report import ImportReport, cameras_of, grouped
+from toolkit.exchange.recordings import NAMES, NO_ACCURACY_M, find_depths, read_fixes, read_times, read_track, to_us
 from toolkit.files import (
     IMPORTED,
     MASKS,
@@ -71,6 +72,8 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 CONVERT = "convert them to JPEG or PNG"
 _HOW = dict.fromkeys(HEIC_SUFFIXES, f"pip install 'visual-localization[heic]', or {CONVERT}")
 PLACING = ("link", "copy")
+EXIF = "exif"
+"""What is given for a table of GPS fixes if the images have them."""
 MIN_INVERTIBLE = 0.9
 """Smallest share of the image in which the distortion of a usable camera can be inverted."""
 NOT_INSIDE = "not a path inside the folder of images"
@@ -101,6 +104,18 @@ class Options(TypedDict, total=False):
     """Move the world to x east, y north, z up, in meters, by the GPS in EXIF of at least three images."""
     positions: str | Path | None
     """The same by a CSV file with the columns image, x, y, z: camera centers, meters."""
+    timestamps: str | Path | None
+    """When images were taken: a file of times and names, or `names`; see `recordings.read_times`. None: from EXIF."""
+    timestamps_unit: str | None
+    """Of all times that are given: `s`, `ms`, `us` or `ns`; None: told by times since 1970."""
+    odometry: str | Path | None
+    """The device's own poses, for the queries: a list as of `recordings.read_track`, with `axes` and `unit_m`."""
+    depth: str | Path | None
+    """Folder of depth maps, see `recordings.find_depths`: PNG, 16 bits, millimeters, 0 and 65535 where unknown."""
+    depth_camera: str | None
+    """Intrinsics of the depth maps, `MODEL, width, height, parameter, ...`, if they are not those of the images."""
+    fixes: str | Path | None
+    """GPS fixes: a table as of `recordings.read_fixes`, or `exif`. They can limit the search, and `gps` takes them."""
     replace: bool
     """Replace a session that exists, at once."""
     add: bool
@@ -147,6 +162,12 @@ class Draft:
     masks: str | Path | None = None
     gps: bool = False
     positions: str | Path | None = None
+    timestamps: str | Path | None = None
+    timestamps_unit: str | None = None
+    odometry: str | Path | None = None
+    depth: str | Path | None = None
+    depth_camera: str | None = None
+    fixes: str | Path | None = None
     replace: bool = False
     add: bool = False
     record: dict[str, Any] = field(default_factory=dict)
@@ -198,6 +219,7 @@ class Draft:
             CaptureError: a session has no image left, or exists; none is written.
             ManifestError: `hold_out` is not 0 or between 2 and the number of frames.
         """
+        self._take_times()
         self._place_world()
         if held is None:
             frames = [image.frame for image in sorted(self.images, key=lambda image: image.name)]
@@ -230,6 +252,17 @@ class Draft:
     def _names(self) -> list[str]:
         return [*(image.name for image in self.images), *(str(row["image"]) for row in self.rows)]
 
+    def _take_times(self) -> None:
+        """Give images the times of `timestamps`, and leave out those without one."""
+        if self.timestamps is None:
+            return
+        times = read_times(self.timestamps, sorted(image.name for image in self.images), self.timestamps_unit)
+        for image in self.images:
+            image.time_us = times.get(image.name)
+        why = "no time in its name" if self.timestamps == NAMES else f"no time in {self.timestamps}"
+        self.rows += [{"image": image.name, "status": why} for image in self.images if image.time_us is None]
+        self.images = [image for image in self.images if image.time_us is not None]
+
     def _place_world(self) -> None:
         """Convert poses to the toolkit's axes and meters, by the given unit, GPS in EXIF or known camera centers."""
         is_aligned = self.gps or self.positions is not None
@@ -253,12 +286,13 @@ class Draft:
         """
         posed = [image for image in self.images if image.frame in self.poses and is_file(self.source(image.name))]
         poses = self._camera_poses(posed)
-        turns, geo = dict[str, int](), dict[str, tuple[float, float, float]]()
+        turns = dict[str, int]()
         for name in poses:
             with suppress(ImageError):
                 turns[name] = quarter_turns(read_header(self.source(name))[1])
-            if self.positions is None and (position := gps_position(self.source(name))) is not None:
-                geo[name] = position
+        places = {} if self.positions is not None else {str(row.get("image")): row for row in self._fixes(list(poses))}
+        keys = "latitude", "longitude", "altitude"
+        geo: dict[str, Any] = {name: tuple(float(row[key]) for key in keys) for name, row in places.items()}
         known = None if self.positions is None else read_positions(Path(self.positions))
         if not poses:
             return
@@ -274,6 +308,14 @@ class Draft:
         self.rigs = [(rig, sensor, make_pose(pose[:3, :3], scale * pose[:3, 3])) for rig, sensor, pose in self.rigs]
         self.record |= placed.record
         self.notes += placed.notes
+
+    def _fixes(self, names: Iterable[str]) -> list[dict[str, Any]]:
+        """Return the GPS fixes of the given table, else those in EXIF of some images."""
+        if self.fixes not in (None, EXIF):
+            return read_fixes(Path(str(self.fixes)))
+        found = ((name, gps_position(self.source(name))) for name in names)
+        keys = "image", "latitude", "longitude", "altitude", "accuracy"
+        return [dict(zip(keys, (name, *at, NO_ACCURACY_M), strict=True)) for name, at in found if at is not None]
 
     def _camera_poses(self, images: Sequence[DraftImage]) -> dict[str, Floats]:
         """Return world_from_cam (4, 4) of images that have one, by name."""
@@ -441,9 +483,14 @@ class Draft:
             "masks": [len(masks), "no features where they are black"] if masks else None, "notes": self.notes,
         } | self.record  # fmt: skip
         record["up"] = f"z, {record['up']}" if "up" in record else f"({up}), as most cameras are held"
+        odometry, fixes, depths = self._odometry(times), self._fix_rows(times), self._find_depths(times)
+        record["odometry"] = [len(odometry), f"poses, from {self.odometry}"] if odometry is not None else None
+        record["GPS"] = [len(fixes), f"fixes, from {self.fixes}"] if fixes else None
+        record["depth maps"] = [len(depths), f"from {self.depth}"] if depths else None
         with write_folder(self.session, self.replace or self.add, keep=self.add) as session:
             files = [(self.source(image.name), session / RAW_DATA / image.path) for image in self.images]
             files += [(path, session / MASKS / f"{IMPORTED}{name}.png") for name, path in masks.items()]
+            files += [(source, session / RAW_DATA / path) for source, (_, _, path) in depths.items()]
             for source, target in files:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 if source.name.lower().endswith(HEIC_SUFFIXES):
@@ -453,7 +500,7 @@ class Draft:
                 else:
                     target.symlink_to(os.path.abspath(source))  # noqa: PTH100 - must not resolve links in the source
             made = session / "new" if self.before else session
-            self._write_tables(made, times)
+            self._write_tables(made, times, odometry, fixes, depths.values())
             listed = table
             if self.before:
                 _append(made, session)
@@ -467,7 +514,71 @@ class Draft:
             write_text(session / IMPORT_RECORD, json.dumps(record, indent=1) + "\n")
         return ImportReport(self.session, table, record)
 
-    def _write_tables(self, session: Path, times: Mapping[str, int]) -> None:
+    def _odometry(self, times: Mapping[str, int]) -> Trajectory | None:
+        """Return the given odometry; None for a map, or if none is given."""
+        if self.odometry is None or self.session.name.endswith("_map"):
+            return None
+        times_file = None if self.timestamps in (None, NAMES) else Path(str(self.timestamps))
+        track = read_track(Path(self.odometry), self.timestamps_unit, times_file)
+        devices = {image.device for image in self.images}
+        if track is None:
+            expected = "lines of 8 (TUM, EuRoC), 12 (KITTI), 13 or 17 numbers (a time and a matrix)"
+            raise CaptureError(f"{self.odometry}: is no list of poses. Expected {expected}.")
+        if len(devices) > 1:
+            do = "Give --camera, if it is one camera, or import them one by one with --device"
+            raise CaptureError(f"{self.odometry}: is of one device, but the images are of {len(devices)}. {do}.")
+        at = track.times_us
+        if at is None:
+            do = "Give them by --timestamps, one per line, or before each line"
+            raise CaptureError(f"{self.odometry}: is of {len(track.poses)} {track.kind} without times. {do}.")
+        if not any(at.min() <= time <= at.max() for time in times.values()):
+            span = f"from {at.min()} to {at.max()} us, the images from {min(times.values())} to {max(times.values())}"
+            raise CaptureError(f"{self.odometry}: no image was taken in its time: {span}. Give --timestamps.")
+        poses = [posed_camera(pose, self.axes, self.unit_m or 1.0) for pose in track.poses]
+        return Trajectory.from_poses(at, [devices.pop()] * len(at), np.stack(poses))
+
+    def _fix_rows(self, times: Mapping[str, int]) -> list[tuple[Any, ...]]:
+        """Return the rows of gps.txt."""
+        of_image, rows = {image.name: times[image.frame] for image in self.images}, dict[int, tuple[Any, ...]]()
+        fixes = [] if self.fixes is None else self._fixes(of_image)
+        given = [row for row in fixes if row.get("timestamp")]
+        at = to_us([row["timestamp"] for row in given], self.timestamps_unit, self.fixes).tolist() if given else []
+        named = [row for row in fixes if row.get("image") in of_image and not row.get("timestamp")]
+        at += [of_image[row["image"]] for row in named]
+        for time_us, row in zip(at, given + named, strict=True):
+            values = (float(row[key]) for key in ("latitude", "longitude", "altitude", "accuracy"))
+            rows[time_us] = (time_us, f"{SUBSESSION}/gps", *values)
+        return [rows[time_us] for time_us in sorted(rows)]
+
+    def _find_depths(self, times: Mapping[str, int]) -> dict[Path, tuple[int, str, str]]:
+        """Return the rows of depths.txt by the file of the depth map.
+
+        Raises:
+            CaptureError: there is none of the images.
+        """
+        if self.depth is None:
+            return {}
+        folder, images = Path(self.depth), {self.source(image.name).resolve() for image in self.images}
+        files = [name for name in walk_files(folder)[0] if name.lower().endswith(".png")]
+        files = [name for name in files if (folder / name).resolve() not in images]
+        found = find_depths(folder, files, {image.name: times[image.frame] for image in self.images})
+        if not found:
+            expected = f"that of {self.images[0].name} under the same name, or with `depth` for `color`"
+            raise CaptureError(f"{folder}: no depth map of an image among {len(files)} PNG files. Expected {expected}.")
+        measured = ((found[image.name], image) for image in self.images if image.name in found)
+        return {
+            file: (times[image.frame], self._depth_sensor(image.sensor), f"{SUBSESSION}/depth/{image.name}.png")
+            for file, image in measured
+        }
+
+    def _depth_sensor(self, sensor: str) -> str:
+        folder, _, name = sensor.rpartition("/")
+        return sensor if self.depth_camera is None else f"{folder}/{name.replace('cam', 'depth')}"
+
+    def _write_tables(
+        self, session: Path, times: Mapping[str, int], odometry: Trajectory | None = None,
+        fixes: Sequence[tuple[Any, ...]] = (), depths: Collection[tuple[int, str, str]] = (),
+    ) -> None:  # fmt: skip
         """Write the text files of the capture format; `times` are the timestamps of the frames, microseconds."""
         frame_of = {(times[image.frame], image.device): image.frame for image in self.images}
         keys = pd.DataFrame(sorted(frame_of), columns=["timestamp", "device_id"])
@@ -478,12 +589,21 @@ class Draft:
         cameras = {image.sensor: image.camera for image in self.images}
         rigs = {image.rig for image in self.images}
         is_map = self.session.name.endswith("_map")
+        sensors = [(name, "", "camera", *camera_text(camera).split(", ")) for name, camera in sorted(cameras.items())]
+        if self.depth_camera is not None:
+            measured = camera_text(parse_camera("depth", self.depth_camera)).split(", ")
+            sensors += [(self._depth_sensor(name), "", "depth", *measured) for name in sorted(cameras)]
+        if fixes:
+            sensors.append((f"{SUBSESSION}/gps", "", "gps"))
+            write_table(session / "gps.txt", ", ".join(name for name, _ in COLUMNS["gps.txt"]),
+                        (", ".join(map(str, row)) for row in fixes))  # fmt: skip
         write_session(
             session,
-            [(name, "", "camera", *camera_text(camera).split(", ")) for name, camera in sorted(cameras.items())],
+            sensors,
             [row for row in self.rigs if row[0] in rigs and row[1] in cameras] or None,
-            trajectory if is_map else None,
+            trajectory if is_map else odometry,
             sorted((times[image.frame], image.sensor, image.path) for image in self.images),
+            depths=sorted(depths) or None,
             subsessions=[SUBSESSION],
             keyframes=None if is_map else {"pruned_subsampled": keys},  # the list localized by default
             ground_truth=None if is_map else trajectory,
@@ -562,6 +682,8 @@ def start(capture: str | Path, device: str, split: str, folder: Path, **options:
         raise ManifestError(f"hold-out: found {draft.hold_out} for a {split}, expected 2 or more, for a map.")
     if draft.hold_out:
         _session(Path(capture), device, "query", may_exist)
+    if draft.odometry is not None and split == "map" and not draft.hold_out:
+        raise ManifestError(f"odometry: {draft.odometry} is given for a map. Give it for queries.")
     return draft
 
 

@@ -28,7 +28,6 @@ from toolkit.exchange.colmap_model import (
     NORM_TOLERANCE,
     encoding_of,
     inverse,
-    is_number,
     read_cameras,
     read_model,
 )
@@ -44,9 +43,10 @@ from toolkit.exchange.drafts import (
     start,
 )
 from toolkit.exchange.import_report import ImportReport
+from toolkit.exchange.recordings import MAX_OFFSET_S, NAMES, Track, lines_of_images, read_times, read_track
 from toolkit.exchange.transforms import import_transforms
 from toolkit.files import file_fingerprint, files_fingerprint, read_json
-from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
+from toolkit.geometry import Floats, invert, make_pose, pose_from_qt, qt_from_pose
 from toolkit.manifest import nearest
 
 POSE_DIRECTIONS = ("world_from_cam", "cam_from_world", "rotation_of_cam_from_world")
@@ -157,16 +157,20 @@ def import_images(
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder of images.")
     draft.convention = poses_are
-    if table is not None:
+    tracks = [None if file is None else read_track(Path(file), draft.timestamps_unit) for file in (table, truth)]
+    if table is not None and tracks[0] is None:
         rows, draft.listed_in = _read_table(Path(table)), "the table"
     else:
         rows = pd.DataFrame({"image": _listed(draft, folder, only or (), skip or ()), "line": 0})
+    for file, track in zip((table, truth), tracks, strict=True):
+        if track is not None:
+            rows = _with_poses(rows, track, draft, file)
     if split == "map" and "qw" not in rows:
         given = f"a table with the columns image, {', '.join(POSE_NAMES)}"
         raise CaptureError(f"A map needs poses: give {given}, or import a transforms.json or a COLMAP model.")
     listed_cameras = read_cameras(Path(cameras)) if cameras is not None else {}
     shared_camera = None if camera is None else camera_at("camera", camera)
-    posed = rows if truth is None else _read_truth(Path(truth), rows, split)
+    posed = rows if truth is None or tracks[1] is not None else _read_truth(Path(truth), rows, split)
     poses = _poses_of(posed, poses_are)
     bad_poses = {str(row["image"]): f"line {row['line']}: {row['problem']}" for row in _bad(posed).to_dict("records")}
     if bad_poses and truth is not None:
@@ -401,7 +405,6 @@ def _read_table(path: Path) -> pd.DataFrame:
         text = path.read_text(encoding=encoding_of(path))  # spreadsheets write UTF-16 and the mark
     except (OSError, UnicodeError) as error:
         raise CaptureError(f"{path}: cannot be read as a CSV table ({error}).") from None
-    _require_names(path, text)
     first = next((line for line in text.splitlines() if line.strip()), "").split()
     of_hloc = len(first) > 4 and first[1] in pycolmap.CameraModelId.__members__
     rows = _read_hloc_list(text) if of_hloc else _read_csv(path, text)
@@ -431,14 +434,21 @@ def _read_table(path: Path) -> pd.DataFrame:
     return rows
 
 
-def _require_names(path: Path, text: str) -> None:
-    """Raise CaptureError for lists of poses without names: those of KITTI and TUM."""
-    lines = [line.replace(",", " ").split() for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
-    count = len(lines[0]) if lines else 0
-    kinds = {12: "KITTI's poses.txt, world_from_cam as 3 x 4 numbers", 8: "TUM's list, time tx ty tz qx qy qz qw"}
-    if count in kinds and all(is_number(word) for word in lines[0]):
-        need = f"a CSV with the header image, {', '.join(POSE_NAMES)} and one image per line"
-        raise CaptureError(f"{path}: looks like {kinds[count]}, without the names of images. Write {need}.")
+def _with_poses(rows: pd.DataFrame, track: Track, draft: Draft, file: object) -> pd.DataFrame:
+    """Return the images with the poses of a list without names: by their times, else one each, in order of names."""
+    names = list(rows["image"])
+    at: list[int | None] = [*(lines_of_images(names, len(track.poses)) or ())]
+    if track.times_us is not None:
+        draft.timestamps = draft.timestamps or NAMES
+        times = read_times(draft.timestamps, names, draft.timestamps_unit)
+        at = [track.nearest(times[name]) if name in times else None for name in names]
+    elif not at:
+        found = f"found {len(track.poses)} poses of {len(names)} images in {draft.folder}"
+        raise CaptureError(f"{file}: {found}, expected one each, or numbers in their names.")
+    draft.notes.append(f"{file}: poses as of {track.kind}, without names of images")
+    qt = np.array([np.full(7, np.nan) if one is None else qt_from_pose(track.poses[one]) for one in at])
+    rows = rows.assign(**dict(zip(POSE_NAMES, qt.T, strict=True)))
+    return rows.assign(problem=["" if one is not None else f"no pose within {MAX_OFFSET_S:g} s" for one in at])
 
 
 def _read_csv(path: Path, text: str) -> pd.DataFrame:

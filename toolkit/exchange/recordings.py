@@ -1,0 +1,222 @@
+"""What recordings have besides images: times, trajectories, GPS fixes and depth maps, in the formats of the field."""
+
+import csv
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from toolkit.errors import CaptureError, ManifestError
+from toolkit.exchange.colmap_model import NORM_TOLERANCE, encoding_of, is_number
+from toolkit.geometry import Floats, Ints, make_pose, pose_from_qt
+
+UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
+"""Microseconds in each unit of time."""
+MAX_OFFSET_S = 0.02
+"""Largest time between an image and what belongs to it, seconds."""
+NO_ACCURACY_M = 10.0
+"""Accuracy of a GPS fix that has none."""
+NAMES = "names"
+"""What is given for a file of times if the times are the last numbers in the names of the images."""
+_SINCE_2001_US, _UNTIL_2096_US = 1e15, 4e15
+
+
+@dataclass(frozen=True)
+class Track:
+    """Poses over time, in the direction and unit of their file, N of them in order of time."""
+
+    times_us: Ints | None  # (N,); None: one per image
+    poses: Floats  # (N, 4, 4)
+    kind: str  # the format
+
+    def nearest(self, time_us: int) -> int | None:
+        """Return the pose that is nearest to a time; None if none is within `MAX_OFFSET_S`."""
+        assert self.times_us is not None
+        at = int(np.searchsorted(self.times_us, time_us))
+        near = [k for k in (at - 1, at) if 0 <= k < len(self.times_us)]
+        best = min(near, key=lambda k: abs(int(self.times_us[k]) - time_us), default=None)  # type: ignore[index]
+        return best if best is not None and abs(int(self.times_us[best]) - time_us) <= MAX_OFFSET_S * 1e6 else None
+
+
+def lines_of(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Return place and words of the lines of a text file that are neither empty nor comments.
+
+    Raises:
+        CaptureError: the file cannot be read.
+    """
+    try:
+        text = path.read_text(encoding=encoding_of(path), errors="replace")
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read ({error.strerror}).") from None
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.strip() and not line.startswith("#"):
+            yield f"{path}, line {number}", line.replace(",", " ").split()
+
+
+def numbers_of(where: str, words: Sequence[str], count: int) -> Floats:
+    """Return the first `count` words as numbers. Raise CaptureError, which names `where`, if they are none."""
+    try:
+        values = np.array([float(word) for word in words[:count]])
+        if len(values) == count:
+            return values
+    except ValueError:
+        pass
+    raise CaptureError(f"{where}: found {' '.join(words)[:80]!r}, expected {count} numbers.")
+
+
+def to_us(times: Iterable[str], unit: str | None, where: object) -> Ints:
+    """Return times (N,) in microseconds.
+
+    Args:
+        unit: of `UNITS_US`; None: told by their size if they are times since 1970.
+
+    Raises:
+        ManifestError: an unknown unit, or it is not known.
+    """
+    if unit is not None and unit not in UNITS_US:
+        raise ManifestError(f"timestamps-unit: found {unit!r}, expected one of {', '.join(UNITS_US)}.")
+    values = np.array([float(time) for time in times])
+    typical = float(np.median(values)) if len(values) else 0.0
+    fitting = [name for name, scale in UNITS_US.items() if _SINCE_2001_US <= typical * scale <= _UNTIL_2096_US]
+    if unit is None and not fitting:
+        raise ManifestError(f"{where}: found times such as {typical:.10g}. Give --timestamps-unit s, ms, us or ns.")
+    return np.round(values * UNITS_US[unit or fitting[0]]).astype(np.int64)
+
+
+def read_times(source: str | Path, names: Sequence[str], unit: str | None) -> dict[str, int]:
+    """Return the time of images, microseconds, by name; those without one are missing.
+
+    Args:
+        source: a file with time and name in each line, in either order; or only times, see `lines_of_images` (KITTI);
+            or `NAMES`.
+        unit: see `to_us`.
+
+    Raises:
+        CaptureError: the file cannot be read, or has times of none of the images.
+        ManifestError: see `to_us`.
+    """
+    found = dict[str, str]()
+    if str(source) == NAMES:
+        found = {name: numbers[-1] for name in names if (numbers := re.findall(r"\d+(?:\.\d+)?", _stem(name)))}
+    else:
+        rows = [words for _, words in lines_of(Path(source)) if any(map(is_number, words))]
+        if all(len(words) == 1 for words in rows) and (lines := lines_of_images(names, len(rows))) is not None:
+            found = {name: rows[line][0] for name, line in zip(names, lines, strict=True)}
+        by_end = {PurePosixPath(name).name: name for name in names} | {name: name for name in names}
+        for first, *rest in (words for words in rows if len(words) > 1):
+            time, name = (first, " ".join(rest)) if is_number(first) else (rest[-1], " ".join([first, *rest[:-1]]))
+            if (listed := by_end.get(name) or by_end.get(PurePosixPath(name).name)) and is_number(time):
+                found[listed] = time
+    if not found:
+        raise CaptureError(f"{source}: has no time of {len(names)} images such as {names[0]}.")
+    return dict(zip(found, to_us(found.values(), unit, source).tolist(), strict=True))
+
+
+def lines_of_images(names: Sequence[str], count: int) -> list[int] | None:
+    """Return the line, from 0, of each image in a file of `count` lines without names: in order of the names, or else
+    that of the last number in its name; None if neither is possible."""
+    if len(names) == count:
+        return np.argsort(np.argsort(names, kind="stable"), kind="stable").tolist()
+    numbers = [re.findall(r"\d+", _stem(name)) for name in names]
+    lines = [int(found[-1]) for found in numbers if found]
+    return lines if len(set(lines)) == len(names) and max(lines) < count else None
+
+
+def read_track(path: Path, unit: str | None, times: Path | None = None) -> Track | None:
+    """Read a list of poses without names of images; None if the file is something else.
+
+    A line has 8 numbers: time, position, qx qy qz qw (TUM), or of nanoseconds and commas: qw qx qy qz, which may be
+    followed by a state (EuRoC); 12: a 3 x 4 matrix (KITTI); 13 or 17: a time, then a 3 x 4 or 4 x 4 matrix, whose
+    columns may follow each other (ARKit).
+
+    Args:
+        unit: of the times, see `to_us`.
+        times: file with a time per line, for lists that have none.
+
+    Raises:
+        CaptureError: the file cannot be read, or a line differs from the first or is no pose.
+        ManifestError: see `to_us`.
+    """
+    rows = list(lines_of(path))
+    if rows and "image" not in rows[0][1] and not is_number(rows[0][1][0]):  # a header
+        del rows[0]
+    count = len(rows[0][1]) if rows else 0
+    if count not in (8, 12, 13, 17) or not all(map(is_number, rows[0][1])):
+        return None
+    table = np.array([numbers_of(where, words, count) for where, words in rows])
+    words = [words[0] for _, words in (rows if count > 12 or count == 8 else lines_of(times) if times else ())]
+    at = to_us(words, unit, path) if len(words) == len(rows) else None
+    matrices = table if count == 12 else table[:, 1:]
+    if count == 17 and np.allclose(matrices[:, [3, 7, 11, 15]], [0, 0, 0, 1]):
+        poses, kind = matrices.reshape(-1, 4, 4).swapaxes(1, 2), "4 x 4 matrices, column by column"
+    elif count == 17 and np.allclose(matrices[:, 12:], [0, 0, 0, 1]):
+        poses, kind = matrices.reshape(-1, 4, 4), "4 x 4 matrices"
+    elif count in (12, 13):
+        rotations = matrices.reshape(-1, 3, 4)
+        poses, kind = make_pose(rotations[:, :, :3], rotations[:, :, 3]), "3 x 4 matrices (KITTI)"
+    else:
+        w_first = count == 17 or table[0, 0] > _SINCE_2001_US * 1e3
+        poses = pose_from_qt(table[:, [4, 5, 6, 7, 1, 2, 3] if w_first else [7, 4, 5, 6, 1, 2, 3]])
+        kind = "EuRoC" if w_first else "TUM"
+    determinants = np.linalg.det(poses[:, :3, :3])
+    lengths = np.linalg.norm(table[:, 4:8], axis=1) if kind in ("EuRoC", "TUM") else np.cbrt(determinants)
+    for row in np.flatnonzero(~(np.abs(lengths - 1) <= NORM_TOLERANCE)).tolist():
+        raise CaptureError(f"{rows[row][0]}: found {' '.join(rows[row][1])[:80]!r}, which is no pose.")
+    order = np.argsort(at, kind="stable") if at is not None else np.arange(len(rows))
+    return Track(None if at is None else at[order], poses[order], kind)
+
+
+def read_fixes(path: Path) -> list[dict[str, str]]:
+    """Read GPS fixes: a CSV file with the columns image or timestamp, latitude, longitude, altitude, and accuracy.
+
+    Altitude and accuracy, in meters, may be missing.
+
+    Raises:
+        CaptureError: the file cannot be read, or a column is missing or has another value than a number.
+    """
+    try:
+        with open(path, encoding=encoding_of(path), newline="") as stream:
+            rows = [dict(row) for row in csv.DictReader(stream, skipinitialspace=True)]
+    except (OSError, UnicodeError, csv.Error) as error:
+        raise CaptureError(f"{path}: cannot be read as a CSV table ({error}).") from None
+    for number, row in enumerate(rows, start=2):
+        row |= {"altitude": row.get("altitude") or "0", "accuracy": row.get("accuracy") or str(NO_ACCURACY_M)}
+        values = [row.get(name) or "" for name in ("latitude", "longitude", "altitude", "accuracy")]
+        if not (row.get("image") or row.get("timestamp")) or not all(map(is_number, values)):
+            expected = "image or timestamp, latitude, longitude, altitude, accuracy"
+            raise CaptureError(f"{path}, line {number}: found {dict(row)}"[:300] + f", expected {expected}.")
+    return rows
+
+
+def find_depths(folder: Path, files: Sequence[str], times_us: Mapping[str, int]) -> dict[str, Path]:
+    """Return the depth maps of images, by the name of the image.
+
+    A depth map has the image's path, but for what follows the first dot and `depth` instead of `color` or `rgb`; or the
+    time that is nearest, within `MAX_OFFSET_S`, where its name is a time in seconds (TUM).
+
+    Args:
+        folder: of the depth maps.
+        files: their paths in it.
+        times_us: of each image, microseconds.
+    """
+    by_key = {_key(file): file for file in files}
+    found = {name: folder / by_key[_key(name)] for name in times_us if _key(name) in by_key}
+    stems = {file: _stem(file) for file in files}
+    if not found and all(map(is_number, stems.values())):
+        order = sorted(files, key=lambda file: float(stems[file]))
+        times = np.array([float(stems[file]) * 1e6 for file in order])
+        track = Track(times.astype(np.int64), np.zeros((len(order), 4, 4)), "")
+        nearest = {name: track.nearest(time) for name, time in times_us.items()}
+        found = {name: folder / order[row] for name, row in nearest.items() if row is not None}
+    return found
+
+
+def _key(name: str) -> str:
+    folder, _, last = name.rpartition("/")
+    return re.sub("color|rgb|image|depth", "", f"{folder}/{last.split('.')[0]}").strip("/")
+
+
+def _stem(name: str) -> str:
+    return PurePosixPath(name).name.rpartition(".")[0]
