@@ -107,7 +107,7 @@ class Options(TypedDict, total=False):
     timestamps: str | Path | None
     """When images were taken: a file of times and names, or `names`; see `recordings.read_times`. None: from EXIF."""
     timestamps_unit: str | None
-    """Of all times that are given: `s`, `ms`, `us` or `ns`; None: told by times since 1970."""
+    """Of these: `s`, `ms`, `us` or `ns`; None: told by times since 1970."""
     odometry: str | Path | None
     """The device's own poses, for the queries: a list as of `recordings.read_track`, with `axes` and `unit_m`."""
     depth: str | Path | None
@@ -519,14 +519,14 @@ class Draft:
         if self.odometry is None or self.session.name.endswith("_map"):
             return None
         times_file = None if self.timestamps in (None, NAMES) else Path(str(self.timestamps))
-        track = read_track(Path(self.odometry), self.timestamps_unit, times_file)
-        devices = {image.device for image in self.images}
+        track = read_track(Path(self.odometry), self.timestamps_unit, times_file, times.values())
         if track is None:
             expected = "lines of 8 (TUM, EuRoC), 12 (KITTI), 13 or 17 numbers (a time and a matrix)"
             raise CaptureError(f"{self.odometry}: is no list of poses. Expected {expected}.")
-        if len(devices) > 1:
-            do = "Give --camera, if it is one camera, or import them one by one with --device"
-            raise CaptureError(f"{self.odometry}: is of one device, but the images are of {len(devices)}. {do}.")
+        # One device, also where each image has its own intrinsics, as those of phones.
+        if len(set(times.values())) < len(times):
+            do = "Import them one by one, with --device"
+            raise CaptureError(f"{self.odometry}: is of one device, but several took images at the same time. {do}.")
         at = track.times_us
         if at is None:
             do = "Give them by --timestamps, one per line, or before each line"
@@ -535,14 +535,15 @@ class Draft:
             span = f"from {at.min()} to {at.max()} us, the images from {min(times.values())} to {max(times.values())}"
             raise CaptureError(f"{self.odometry}: no image was taken in its time: {span}. Give --timestamps.")
         poses = [posed_camera(pose, self.axes, self.unit_m or 1.0) for pose in track.poses]
-        return Trajectory.from_poses(at, [devices.pop()] * len(at), np.stack(poses))
+        return Trajectory.from_poses(at, [self.images[0].device] * len(at), np.stack(poses))
 
     def _fix_rows(self, times: Mapping[str, int]) -> list[tuple[Any, ...]]:
         """Return the rows of gps.txt."""
         of_image, rows = {image.name: times[image.frame] for image in self.images}, dict[int, tuple[Any, ...]]()
         fixes = [] if self.fixes is None else self._fixes(of_image)
         given = [row for row in fixes if row.get("timestamp")]
-        at = to_us([row["timestamp"] for row in given], self.timestamps_unit, self.fixes).tolist() if given else []
+        stamps = [row["timestamp"] for row in given]
+        at = to_us(stamps, self.timestamps_unit, self.fixes, times.values()).tolist() if given else []
         named = [row for row in fixes if row.get("image") in of_image and not row.get("timestamp")]
         at += [of_image[row["image"]] for row in named]
         for time_us, row in zip(at, given + named, strict=True):
@@ -654,13 +655,17 @@ class Draft:
         in_zones = len(zones) == len(frames) and len(set(zones.values())) > 1  # a journey, or daylight saving ended
         if in_zones:
             taken = {frame: time - zones[frame] for frame, time in taken.items()}
-        if len(taken) == len(frames) == len(set(taken.values())) and self.old_times.isdisjoint(taken.values()):
+        # Clocks of devices differ, so equal times in EXIF mean nothing; several may take an image at a given time.
+        device_of = {image.frame: image.device if self.given_times else "" for image in self.images}
+        different = len({(time_us, device_of[frame]) for frame, time_us in taken.items()}) == len(frames)
+        if different and self.old_times.isdisjoint(taken.values()):
             zone = ", in UTC, as its time zone changes" if in_zones else ""
             if zones and len(zones) < len(frames):
                 zone = "; only some images have a time zone, which is ignored"
             self.times_from = "as given" if self.given_times else f"camera clock, from EXIF{zone}"
             return taken
-        why = f"some images have {'no' if len(taken) < len(frames) else 'the same'} time in EXIF"
+        why = f"some images have {'no' if len(taken) < len(frames) else 'the same'} time"
+        why += "" if self.given_times else " in EXIF"
         self.times_from = f"made up, one second apart in the order of the images ({why})"
         first = max(self.old_times, default=0) // 10**6 + 1
         return {frame: (number + first) * 10**6 for number, frame in enumerate(frames)}

@@ -66,19 +66,23 @@ def numbers_of(where: str, words: Sequence[str], count: int) -> Floats:
     raise CaptureError(f"{where}: found {' '.join(words)[:80]!r}, expected {count} numbers.")
 
 
-def to_us(times: Iterable[str], unit: str | None, where: object) -> Ints:
+def to_us(times: Iterable[str], unit: str | None, where: object, near_us: Iterable[int] = ()) -> Ints:
     """Return times (N,) in microseconds.
 
     Args:
         unit: of `UNITS_US`; None: told by their size if they are times since 1970.
+        near_us: times of images; the unit is that in which most of them are among the given times, if any is.
 
     Raises:
         ManifestError: an unknown unit, or it is not known.
     """
     if unit is not None and unit not in UNITS_US:
         raise ManifestError(f"timestamps-unit: found {unit!r}, expected one of {', '.join(UNITS_US)}.")
-    values = np.array([float(time) for time in times])
+    values, near = np.array([float(time) for time in times]), np.array([*near_us])
     typical = float(np.median(values)) if len(values) else 0.0
+    within = {name: np.sum((values.min() * scale <= near) & (near <= values.max() * scale)) if len(values) else 0
+              for name, scale in UNITS_US.items()}  # fmt: skip
+    unit = max(within, key=lambda name: within[name]) if any(within.values()) else unit
     fitting = [name for name, scale in UNITS_US.items() if _SINCE_2001_US <= typical * scale <= _UNTIL_2096_US]
     if unit is None and not fitting:
         raise ManifestError(f"{where}: found times such as {typical:.10g}. Give --timestamps-unit s, ms, us or ns.")
@@ -124,7 +128,9 @@ def lines_of_images(names: Sequence[str], count: int) -> list[int] | None:
     return lines if len(set(lines)) == len(names) and max(lines) < count else None
 
 
-def read_track(path: Path, unit: str | None, times: Path | None = None) -> Track | None:
+def read_track(
+    path: Path, unit: str | None, times: Path | None = None, near_us: Iterable[int] = ()
+) -> Track | None:  # fmt: skip
     """Read a list of poses without names of images; None if the file is something else.
 
     A line has 8 numbers: time, position, qx qy qz qw (TUM), or of nanoseconds and commas: qw qx qy qz, which may be
@@ -132,7 +138,7 @@ def read_track(path: Path, unit: str | None, times: Path | None = None) -> Track
     columns may follow each other (ARKit).
 
     Args:
-        unit: of the times, see `to_us`.
+        unit, near_us: see `to_us`.
         times: file with a time per line, for lists that have none.
 
     Raises:
@@ -147,7 +153,7 @@ def read_track(path: Path, unit: str | None, times: Path | None = None) -> Track
         return None
     table = np.array([numbers_of(where, words, count) for where, words in rows])
     words = [words[0] for _, words in (rows if count > 12 or count == 8 else lines_of(times) if times else ())]
-    at = to_us(words, unit, path) if len(words) == len(rows) else None
+    at = to_us(words, unit, path, near_us) if len(words) == len(rows) else None
     matrices = table if count == 12 else table[:, 1:]
     if count == 17 and np.allclose(matrices[:, [3, 7, 11, 15]], [0, 0, 0, 1]):
         poses, kind = matrices.reshape(-1, 4, 4).swapaxes(1, 2), "4 x 4 matrices, column by column"
