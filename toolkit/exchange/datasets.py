@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Unpack
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -20,7 +20,7 @@ import yaml
 from toolkit.capture.images import stored_size
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.colmap_model import ColmapModel, inverse, read_model
-from toolkit.exchange.drafts import Options, every_nth, start
+from toolkit.exchange.drafts import every_nth, start
 from toolkit.exchange.import_report import ImportReport
 from toolkit.exchange.interchange import camera_at
 from toolkit.exchange.recordings import MAX_OFFSET_S, lines_of, numbers_of, read_track
@@ -68,7 +68,7 @@ class Layout:
 
 def import_dataset(
     kind: str, path: str | Path, capture: str | Path, scene: str | None = None, device: str = "ios",
-    every: int = 1, **options: Unpack[Options],
+    every: int = 1, **options: Any,
 ) -> ImportReport:  # fmt: skip
     """Make a map and a query session from a data set of the field.
 

@@ -13,11 +13,11 @@ import shutil
 import time
 import unicodedata
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Any, TypedDict, Unpack
+from typing import Any, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -45,7 +45,16 @@ from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.georeference import alignment, gps_position, quarter_turns, read_positions
 from toolkit.exchange.import_report import ImportReport, cameras_of, grouped
-from toolkit.exchange.recordings import NAMES, NO_ACCURACY_M, find_depths, read_fixes, read_times, read_track, to_us
+from toolkit.exchange.recordings import (
+    FIX,
+    NAMES,
+    NO_ACCURACY_M,
+    find_depths,
+    read_fixes,
+    read_times,
+    read_track,
+    to_us,
+)
 from toolkit.files import (
     IMPORTED,
     MASKS,
@@ -84,43 +93,44 @@ _AXES = {"opencv": "camera x right, y down, z forward", "opengl": "camera x righ
 _MOST_FOR_UP = 300  # cameras that tell what is up
 
 
-class Options(TypedDict, total=False):
-    """What all imports take, besides their own input; the defaults are those of `Draft`."""
+@dataclass(kw_only=True)
+class Options:
+    """What all imports take, besides their own input."""
 
-    placing: str
+    placing: str = "link"
     """`link` to the images, or `copy` them."""
-    axes: str
+    axes: str = "opencv"
     """Camera axes of the poses, see `AXES`."""
-    unit_m: float | None
+    unit_m: float | None = None
     """Meters per unit of the poses; None: unknown, as after structure from motion. The poses are then not scaled, and
     the session records that their unit is unknown."""
-    hold_out: int
+    hold_out: int = 0
     """Every `hold_out`-th frame of a map, in order of names, becomes a query with ground truth instead; 0: none."""
-    match_names: bool
+    match_names: bool = False
     """Take files whose names differ only in case, extension or separators."""
-    masks: str | Path | None
+    masks: str | Path | None = None
     """Folder of masks, see `images.find_mask`; they are placed as the images are."""
-    gps: bool
-    """Move the world to x east, y north, z up, in meters, by the GPS in EXIF of at least three images."""
-    positions: str | Path | None
+    gps: bool = False
+    """Move the world to x east, y north, z up, in meters, by the GPS of at least three images: of `fixes`, or EXIF."""
+    positions: str | Path | None = None
     """The same by a CSV file with the columns image, x, y, z: camera centers, meters."""
-    timestamps: str | Path | None
+    timestamps: str | Path | None = None
     """When images were taken: a file of times and names, or `names`; see `recordings.read_times`. None: from EXIF."""
-    timestamps_unit: str | None
+    timestamps_unit: str | None = None
     """Of these: `s`, `ms`, `us` or `ns`; None: told by times since 1970."""
-    odometry: str | Path | None
+    odometry: str | Path | None = None
     """The device's own poses, for the queries: a list as of `recordings.read_track`, with `axes` and `unit_m`."""
-    depth: str | Path | None
+    depth: str | Path | None = None
     """Folder of depth maps, see `recordings.find_depths`: PNG, 16 bits, millimeters, 0 and 65535 where unknown."""
-    depth_camera: str | None
+    depth_camera: str | None = None
     """Intrinsics of the depth maps, `MODEL, width, height, parameter, ...`, if they are not those of the images."""
-    fixes: str | Path | None
-    """GPS fixes: a table as of `recordings.read_fixes`, or `exif`. They can limit the search, and `gps` takes them."""
-    replace: bool
+    fixes: str | Path | None = None
+    """GPS fixes, which can limit the search: a table as of `recordings.read_fixes`, or `exif`."""
+    replace: bool = False
     """Replace a session that exists, at once."""
-    add: bool
+    add: bool = False
     """Add the images that a session lacks; what it has stays as it is."""
-    record: dict[str, Any]
+    record: dict[str, Any] = field(default_factory=dict)
     """Further content of `proc/import.json`."""
 
 
@@ -148,29 +158,18 @@ class DraftImage:
         return self.rig or self.sensor
 
 
+Prepared: TypeAlias = tuple[
+    dict[str, int], dict[str, Path], Trajectory | None, list[tuple[Any, ...]], dict[Path, tuple[int, str, str]]
+]
+"""Times of frames, masks of images, odometry, rows of gps.txt, and rows of depths.txt by the file."""
+
+
 @dataclass
-class Draft:
+class Draft(Options):
     """A session being assembled."""
 
     session: Path
     folder: Path  # folder of the images
-    placing: str = "link"
-    axes: str = "opencv"
-    unit_m: float | None = None
-    hold_out: int = 0
-    match_names: bool = False
-    masks: str | Path | None = None
-    gps: bool = False
-    positions: str | Path | None = None
-    timestamps: str | Path | None = None
-    timestamps_unit: str | None = None
-    odometry: str | Path | None = None
-    depth: str | Path | None = None
-    depth_camera: str | None = None
-    fixes: str | Path | None = None
-    replace: bool = False
-    add: bool = False
-    record: dict[str, Any] = field(default_factory=dict)
     images: list[DraftImage] = field(default_factory=list)
     rows: list[dict[str, Any]] = field(default_factory=list)  # rows of `proc/import.csv`
     poses: dict[str, Floats] = field(default_factory=dict)  # world_from_device (4, 4) by frame; queries may have none
@@ -187,6 +186,7 @@ class Draft:
     times_from: str = ""
     before: int = 0  # images in the session that these are added to
     old_times: frozenset[int] = frozenset()  # and their timestamps
+    prepared: Prepared | None = None
     sensors: dict[str, str] = field(default_factory=dict)  # id by `camera_text`, for images that are not in a rig
     started: float = field(default_factory=time.perf_counter)
 
@@ -229,6 +229,7 @@ class Draft:
         for draft in drafts:
             draft.follow()
             draft.leave_out()
+            draft.prepared = draft._prepare()  # all errors come before a session is written
         if self.listed_in:
             listed |= {_composed(name) for draft in drafts for name in draft._names()}
             self.others[f"not in {self.listed_in}"] = self._others_than(listed)
@@ -290,9 +291,8 @@ class Draft:
         for name in poses:
             with suppress(ImageError):
                 turns[name] = quarter_turns(read_header(self.source(name))[1])
-        places = {} if self.positions is not None else {str(row.get("image")): row for row in self._fixes(list(poses))}
-        keys = "latitude", "longitude", "altitude"
-        geo: dict[str, Any] = {name: tuple(float(row[key]) for key in keys) for name, row in places.items()}
+        fixes = self._fixes() if self.positions is None else pd.DataFrame(columns=["image", *FIX])
+        geo: dict[str, Any] = dict(zip(fixes["image"], fixes[list(FIX[:3])].to_numpy(float), strict=True))
         known = None if self.positions is None else read_positions(Path(self.positions))
         if not poses:
             return
@@ -309,13 +309,13 @@ class Draft:
         self.record |= placed.record
         self.notes += placed.notes
 
-    def _fixes(self, names: Iterable[str]) -> list[dict[str, Any]]:
-        """Return the GPS fixes of the given table, else those in EXIF of some images."""
+    def _fixes(self) -> pd.DataFrame:
+        """Return the GPS fixes of the given table, see `recordings.read_fixes`, else those in EXIF."""
         if self.fixes not in (None, EXIF):
             return read_fixes(Path(str(self.fixes)))
-        found = ((name, gps_position(self.source(name))) for name in names)
-        keys = "image", "latitude", "longitude", "altitude", "accuracy"
-        return [dict(zip(keys, (name, *at, NO_ACCURACY_M), strict=True)) for name, at in found if at is not None]
+        found = ((image.name, gps_position(self.source(image.name))) for image in self.images)
+        rows = [(name, "", *at, NO_ACCURACY_M) for name, at in found if at is not None]
+        return pd.DataFrame(rows, columns=["image", "timestamp", *FIX])
 
     def _camera_poses(self, images: Sequence[DraftImage]) -> dict[str, Floats]:
         """Return world_from_cam (4, 4) of images that have one, by name."""
@@ -347,14 +347,19 @@ class Draft:
             return
         old = Session.open(self.session)
         known, unit = set(map(own_name, old.image_names)), read_json(self.session / IMPORT_RECORD).get("unit", "m")
-        if unit != self.record.setdefault("unit", unit) and self.poses:
-            found, expected = self.record["unit"] or "unknown", unit or "unknown"
-            raise CaptureError(f"{self.session}: the unit of its poses is {expected}, that of the new ones {found}.")
-        names = [image.name for image in self.images if {image.name, f"{image.name}.png"} & known]
-        self.others |= {"in the session already": names} if names else {}
-        self.images = [image for image in self.images if image.name not in set(names)]
+        found = self.record.get("unit", unit) if self.poses else unit
+        if found != unit:
+            units = f"{unit or 'unknown'}, that of the new ones {found or 'unknown'}"
+            raise CaptureError(f"{self.session}: the unit of its poses is {units}.")
+        self.record = self.record | {"unit": unit}
+        images, self.images = self.images, []
+        for image in images:
+            if known.isdisjoint((image.name, f"{image.name}.png")):
+                self.images.append(image)
+            else:
+                self.others.setdefault("in the session already", []).append(image.name)
         if not self.images:
-            raise CaptureError(f"{self.session}: has all {len(names)} images already, so there is none to add.")
+            raise CaptureError(f"{self.session}: has all {len(images)} images already, so there is none to add.")
         if not is_linked_here(self.session):  # links of others do not become the user's own
             self.placing = "copy"
         self.before, self.old_times = len(known), frozenset(old.images["timestamp"].tolist())
@@ -458,11 +463,15 @@ class Draft:
         self.notes += notes
         return "; ".join(notes)
 
+    def _prepare(self) -> Prepared:
+        times = self._choose_times()
+        return times, self._find_masks(), self._odometry(times), self._fix_rows(times), self._find_depths(times)
+
     def write(self) -> ImportReport:
         """Write the session; call `leave_out` before."""
         if turned := sum(image.turned for image in self.images):
             self.notes.append(f"{turned} images have an EXIF orientation, which is ignored: pixels are used as stored")
-        times, masks = self._choose_times(), self._find_masks()
+        times, masks, odometry, fixes, depths = self.prepared or self._prepare()
         columns = ["image", "status", "path", "timestamp", "sensor_id", "device_id", "camera"]
         left_out = [(str(row["image"]), str(row["status"])) for row in self.rows]
         left_out += [(name, reason) for reason, names in self.others.items() for name in names]
@@ -483,7 +492,6 @@ class Draft:
             "masks": [len(masks), "no features where they are black"] if masks else None, "notes": self.notes,
         } | self.record  # fmt: skip
         record["up"] = f"z, {record['up']}" if "up" in record else f"({up}), as most cameras are held"
-        odometry, fixes, depths = self._odometry(times), self._fix_rows(times), self._find_depths(times)
         record["odometry"] = [len(odometry), f"poses, from {self.odometry}"] if odometry is not None else None
         record["GPS"] = [len(fixes), f"fixes, from {self.fixes}"] if fixes else None
         record["depth maps"] = [len(depths), f"from {self.depth}"] if depths else None
@@ -539,16 +547,15 @@ class Draft:
 
     def _fix_rows(self, times: Mapping[str, int]) -> list[tuple[Any, ...]]:
         """Return the rows of gps.txt."""
-        of_image, rows = {image.name: times[image.frame] for image in self.images}, dict[int, tuple[Any, ...]]()
-        fixes = [] if self.fixes is None else self._fixes(of_image)
-        given = [row for row in fixes if row.get("timestamp")]
-        stamps = [row["timestamp"] for row in given]
-        at = to_us(stamps, self.timestamps_unit, self.fixes, times.values()).tolist() if given else []
-        named = [row for row in fixes if row.get("image") in of_image and not row.get("timestamp")]
-        at += [of_image[row["image"]] for row in named]
-        for time_us, row in zip(at, given + named, strict=True):
-            values = (float(row[key]) for key in ("latitude", "longitude", "altitude", "accuracy"))
-            rows[time_us] = (time_us, f"{SUBSESSION}/gps", *values)
+        if self.fixes is None:
+            return []
+        fixes, of_image = self._fixes(), {image.name: times[image.frame] for image in self.images}
+        timed = fixes[fixes["timestamp"] != ""]
+        named = fixes[(fixes["timestamp"] == "") & fixes["image"].isin(of_image.keys())]
+        at = to_us(timed["timestamp"], self.timestamps_unit, self.fixes, times.values()).tolist() if len(timed) else []
+        at += named["image"].map(of_image).tolist()
+        values = pd.concat([timed, named])[list(FIX)].to_numpy(float).tolist()
+        rows = {time_us: (time_us, f"{SUBSESSION}/gps", *row) for time_us, row in zip(at, values, strict=True)}
         return [rows[time_us] for time_us in sorted(rows)]
 
     def _find_depths(self, times: Mapping[str, int]) -> dict[Path, tuple[int, str, str]]:
@@ -671,7 +678,7 @@ class Draft:
         return {frame: (number + first) * 10**6 for number, frame in enumerate(frames)}
 
 
-def start(capture: str | Path, device: str, split: str, folder: Path, **options: Unpack[Options]) -> Draft:
+def start(capture: str | Path, device: str, split: str, folder: Path, **options: Any) -> Draft:
     """Return the draft of a new session. Raise CaptureError if it exists, ManifestError for an invalid argument."""
     may_exist = options.get("replace", False) or options.get("add", False)
     draft = Draft(_session(Path(capture), device, split, may_exist), folder, **options)

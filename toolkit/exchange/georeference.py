@@ -1,6 +1,5 @@
 """Make a reconstruction level and metric by GPS, known positions or a distance, and find its poses on the Earth."""
 
-import csv
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,7 @@ from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.images import HEADER_ERRORS, ORIENTATION, read_number
 from toolkit.capture.world_up import up_of_cameras
 from toolkit.errors import CaptureError, ManifestError
+from toolkit.exchange.recordings import numbers_in, read_csv
 from toolkit.files import own_name, read_json
 from toolkit.geometry import Floats, invert, make_pose
 
@@ -161,22 +161,11 @@ def read_positions(path: Path) -> dict[str, Floats]:
     Raises:
         CaptureError: the file cannot be read, or a row is malformed; names the line.
     """
-    positions = {}
-    try:
-        with open(path, encoding="utf-8-sig", newline="") as stream:
-            reader = csv.DictReader(stream, skipinitialspace=True)
-            for row in reader:
-                try:
-                    values = np.array([float(row[axis]) for axis in "xyz"])
-                    if not np.isfinite(values).all():
-                        raise ValueError
-                    positions[row["image"].strip()] = values
-                except (KeyError, TypeError, ValueError, AttributeError):
-                    found = f"found {dict(row)}"[:200]
-                    raise CaptureError(f"{path}, line {reader.line_num}: {found}, expected image,x,y,z.") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise CaptureError(f"{path}: cannot be read as a CSV table ({error}).") from None
-    return positions
+    rows = read_csv(path)
+    values = numbers_in(rows, ("x", "y", "z"), path)
+    if "image" not in rows:
+        raise CaptureError(f"{path}: column 'image' is missing; expected image,x,y,z.")
+    return dict(zip(rows["image"].str.strip(), values, strict=True))
 
 
 def quarter_turns(exif: Mapping[int, Any]) -> int:

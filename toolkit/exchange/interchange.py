@@ -6,13 +6,11 @@ separated by spaces) give the camera directly. The order of columns is free; unk
 of hloc, `name MODEL width height parameters` per line, is accepted in place of the table.
 """
 
-import csv
-import io
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,7 +24,6 @@ from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.colmap_model import (
     NORM_TOLERANCE,
-    encoding_of,
     inverse,
     read_cameras,
     read_model,
@@ -37,13 +34,21 @@ from toolkit.exchange.drafts import (
     SUBSESSION,
     Draft,
     DraftImage,
-    Options,
     heic_is_read,
     list_images,
     start,
 )
 from toolkit.exchange.import_report import ImportReport
-from toolkit.exchange.recordings import MAX_OFFSET_S, NAMES, Track, lines_of_images, read_times, read_track
+from toolkit.exchange.recordings import (
+    MAX_OFFSET_S,
+    NAMES,
+    Track,
+    lines_of_images,
+    read_csv,
+    read_text,
+    read_times,
+    read_track,
+)
 from toolkit.exchange.transforms import import_transforms
 from toolkit.files import file_fingerprint, files_fingerprint, read_json
 from toolkit.geometry import Floats, invert, make_pose, pose_from_qt, qt_from_pose
@@ -55,7 +60,7 @@ _CAMERA_COLUMNS = ("model", "width", "height", "params")
 
 def import_colmap(
     model: str | Path, images: str | Path, capture: str | Path, device: str = "ios", split: str = "map",
-    **options: Unpack[Options],
+    **options: Any,
 ) -> ImportReport:  # fmt: skip
     """Make a session from a COLMAP model and its images: cameras, poses, and the rigs that have several cameras.
 
@@ -122,7 +127,7 @@ def import_images(
     images: str | Path, capture: str | Path, device: str = "ios", split: str = "query", table: str | Path | None = None,
     poses_are: str = "world_from_cam", camera: str | None = None, cameras: str | Path | None = None,
     truth: str | Path | None = None, only: Sequence[str] | None = None, skip: Sequence[str] | None = None,
-    **options: Unpack[Options],
+    **options: Any,
 ) -> ImportReport:  # fmt: skip
     """Make a session from a folder of images without rigs.
 
@@ -401,13 +406,10 @@ def _read_table(path: Path) -> pd.DataFrame:
     """
     if _is_transforms(path):
         raise CaptureError(f"{path}: not a CSV table. Import it by python -m toolkit import transforms.")
-    try:
-        text = path.read_text(encoding=encoding_of(path))  # spreadsheets write UTF-16 and the mark
-    except (OSError, UnicodeError) as error:
-        raise CaptureError(f"{path}: cannot be read as a CSV table ({error}).") from None
+    text = read_text(path)
     first = next((line for line in text.splitlines() if line.strip()), "").split()
     of_hloc = len(first) > 4 and first[1] in pycolmap.CameraModelId.__members__
-    rows = _read_hloc_list(text) if of_hloc else _read_csv(path, text)
+    rows = _read_hloc_list(text) if of_hloc else read_csv(path)
     columns = ("image", *POSE_NAMES, "camera_id", *_CAMERA_COLUMNS)
     for name, count in Counter(rows.columns[:-1]).items():
         if name not in columns:
@@ -449,24 +451,6 @@ def _with_poses(rows: pd.DataFrame, track: Track, draft: Draft, file: object) ->
     qt = np.array([np.full(7, np.nan) if one is None else qt_from_pose(track.poses[one]) for one in at])
     rows = rows.assign(**dict(zip(POSE_NAMES, qt.T, strict=True)))
     return rows.assign(problem=["" if one is not None else f"no pose within {MAX_OFFSET_S:g} s" for one in at])
-
-
-def _read_csv(path: Path, text: str) -> pd.DataFrame:
-    """Read a CSV table with a header. Empty values beyond its columns, which spreadsheets write, are ignored."""
-    reader = csv.reader(io.StringIO(text), skipinitialspace=True, strict=True)
-    rows: list[list[str | int]] = []
-    try:
-        header = next(reader, [])
-        while header and not header[-1].strip():
-            header.pop()
-        for values in reader:
-            if any(value.strip() for value in values[len(header) :]):
-                found = f"found {len(values)} values, expected {len(header)}, as in the header"
-                raise CaptureError(f"{path}, line {reader.line_num}: {found}. A comma in a value needs double quotes.")
-            rows.append([*values[: len(header)], *[""] * (len(header) - len(values)), reader.line_num])
-    except csv.Error as error:
-        raise CaptureError(f"{path}, line {reader.line_num}: cannot be read as a CSV table ({error}).") from None
-    return pd.DataFrame(rows, columns=[*header, "line"])
 
 
 def _read_hloc_list(text: str) -> pd.DataFrame:

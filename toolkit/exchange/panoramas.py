@@ -4,7 +4,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Unpack
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 from toolkit.capture.images import default_workers, find_mask, prefetch, read_image
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError, ImageError
-from toolkit.exchange.drafts import AXES, SUBSESSION, DraftImage, Options, list_images, start
+from toolkit.exchange.drafts import AXES, SUBSESSION, DraftImage, list_images, start
 from toolkit.exchange.import_report import ImportReport
 from toolkit.exchange.interchange import read_poses
 from toolkit.geometry import Floats, make_pose
@@ -26,7 +26,7 @@ _LARGEST = 2**15 - 1  # side of an image that cv2.remap can read, pixels
 
 def import_panoramas(
     images: str | Path, capture: str | Path, device: str = "ios", split: str = "query", table: str | Path | None = None,
-    poses_are: str = "world_from_cam", **options: Unpack[Options],
+    poses_are: str = "world_from_cam", **options: Any,
 ) -> ImportReport:  # fmt: skip
     """Make a session of equirectangular panoramas: a map with poses, or queries, whose poses become ground truth.
 

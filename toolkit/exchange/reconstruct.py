@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -25,7 +25,7 @@ from toolkit.capture.cameras import camera_text
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.embedders.vlad import Vlad
 from toolkit.errors import CaptureError, ManifestError, WeightsError
-from toolkit.exchange.drafts import SUBSESSION, Draft, DraftImage, Options, every_nth, list_images, start
+from toolkit.exchange.drafts import SUBSESSION, Draft, DraftImage, every_nth, list_images, start
 from toolkit.exchange.georeference import RECORD, place, read_positions
 from toolkit.exchange.import_report import ImportReport
 from toolkit.exchange.interchange import once
@@ -332,7 +332,7 @@ def _quiet() -> Iterator[None]:
 def reconstruct(
     sources: Sequence[str | Path], capture: str | Path, device: str = "ios", fps: float | None = None,
     camera: str | None = None, distance: tuple[str, str, float] | None = None, mapper: str = "incremental",
-    **options: Unpack[Options],
+    **options: Any,
 ) -> Reconstruction:  # fmt: skip
     """Make a map session from photographs without poses, and with `hold_out` a query session with ground truth.
 

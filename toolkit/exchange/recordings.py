@@ -1,12 +1,14 @@
 """What recordings have besides images: times, trajectories, GPS fixes and depth maps, in the formats of the field."""
 
 import csv
+import io
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+import pandas as pd
 
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.colmap_model import NORM_TOLERANCE, encoding_of, is_number
@@ -18,6 +20,8 @@ MAX_OFFSET_S = 0.02
 """Largest time between an image and what belongs to it, seconds."""
 NO_ACCURACY_M = 10.0
 """Accuracy of a GPS fix that has none."""
+FIX = ("latitude", "longitude", "altitude", "accuracy")
+"""Columns of a GPS fix, degrees and meters."""
 NAMES = "names"
 """What is given for a file of times if the times are the last numbers in the names of the images."""
 _SINCE_2001_US, _UNTIL_2096_US = 1e15, 4e15
@@ -40,19 +44,57 @@ class Track:
         return best if best is not None and abs(int(self.times_us[best]) - time_us) <= MAX_OFFSET_S * 1e6 else None
 
 
-def lines_of(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Return place and words of the lines of a text file that are neither empty nor comments.
+def read_text(path: Path, errors: str = "strict") -> str:
+    """Return the content of a text file in UTF-8 or UTF-16, as spreadsheets write it.
 
     Raises:
         CaptureError: the file cannot be read.
     """
     try:
-        text = path.read_text(encoding=encoding_of(path), errors="replace")
-    except OSError as error:
-        raise CaptureError(f"{path}: cannot be read ({error.strerror}).") from None
-    for number, line in enumerate(text.splitlines(), start=1):
+        return path.read_text(encoding=encoding_of(path), errors=errors)
+    except (OSError, UnicodeError) as error:
+        raise CaptureError(f"{path}: cannot be read as text ({error}).") from None
+
+
+def lines_of(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Return place and words of the lines of a text file, see `read_text`, that are neither empty nor comments."""
+    for number, line in enumerate(read_text(path, "replace").splitlines(), start=1):
         if line.strip() and not line.startswith("#"):
             yield f"{path}, line {number}", line.replace(",", " ").split()
+
+
+def read_csv(path: Path) -> pd.DataFrame:
+    """Read a CSV table with a header, all values as text, with the additional column `line`.
+
+    Empty values beyond its columns, which spreadsheets write, are ignored.
+
+    Raises:
+        CaptureError: the file cannot be read, or a line has other columns than the header.
+    """
+    reader = csv.reader(io.StringIO(read_text(path)), skipinitialspace=True, strict=True)
+    rows: list[list[str | int]] = []
+    try:
+        header = next(reader, [])
+        while header and not header[-1].strip():
+            header.pop()
+        for values in reader:
+            if any(value.strip() for value in values[len(header) :]):
+                found = f"found {len(values)} values, expected {len(header)}, as in the header"
+                raise CaptureError(f"{path}, line {reader.line_num}: {found}. A comma in a value needs double quotes.")
+            rows.append([*values[: len(header)], *[""] * (len(header) - len(values)), reader.line_num])
+    except csv.Error as error:
+        raise CaptureError(f"{path}, line {reader.line_num}: cannot be read as a CSV table ({error}).") from None
+    return pd.DataFrame(rows, columns=[*header, "line"])
+
+
+def numbers_in(rows: pd.DataFrame, columns: Sequence[str], path: Path) -> Floats:
+    """Return columns of a table, see `read_csv`, as numbers. Raise CaptureError if one is missing or has another value.
+    """
+    table = rows.reindex(columns=columns).apply(pd.to_numeric, errors="coerce").to_numpy(float)
+    for row in np.flatnonzero(~np.isfinite(table).all(axis=1)).tolist():
+        found = ", ".join(map(str, rows.iloc[row, :-1]))
+        raise CaptureError(f"{path}, line {rows['line'].iloc[row]}: found {found}, expected {', '.join(columns)}.")
+    return table
 
 
 def numbers_of(where: str, words: Sequence[str], count: int) -> Floats:
@@ -174,25 +216,24 @@ def read_track(
     return Track(None if at is None else at[order], poses[order], kind)
 
 
-def read_fixes(path: Path) -> list[dict[str, str]]:
+def read_fixes(path: Path) -> pd.DataFrame:
     """Read GPS fixes: a CSV file with the columns image or timestamp, latitude, longitude, altitude, and accuracy.
 
     Altitude and accuracy, in meters, may be missing.
 
+    Returns:
+        A table with all columns, image and timestamp as text; empty where there is none.
+
     Raises:
         CaptureError: the file cannot be read, or a column is missing or has another value than a number.
     """
-    try:
-        with open(path, encoding=encoding_of(path), newline="") as stream:
-            rows = [dict(row) for row in csv.DictReader(stream, skipinitialspace=True)]
-    except (OSError, UnicodeError, csv.Error) as error:
-        raise CaptureError(f"{path}: cannot be read as a CSV table ({error}).") from None
-    for number, row in enumerate(rows, start=2):
-        row |= {"altitude": row.get("altitude") or "0", "accuracy": row.get("accuracy") or str(NO_ACCURACY_M)}
-        values = [row.get(name) or "" for name in ("latitude", "longitude", "altitude", "accuracy")]
-        if not (row.get("image") or row.get("timestamp")) or not all(map(is_number, values)):
-            expected = "image or timestamp, latitude, longitude, altitude, accuracy"
-            raise CaptureError(f"{path}, line {number}: found {dict(row)}"[:300] + f", expected {expected}.")
+    rows = read_csv(path)
+    defaults = {"image": "", "timestamp": "", "altitude": "0", "accuracy": str(NO_ACCURACY_M)}
+    rows = rows.assign(**{name: rows[name].replace("", value) if name in rows else value
+                          for name, value in defaults.items()})  # fmt: skip
+    rows[list(FIX)] = numbers_in(rows, FIX, path)
+    for line in rows["line"][(rows["image"] == "") & (rows["timestamp"] == "")]:
+        raise CaptureError(f"{path}, line {line}: expected the columns image or timestamp, {', '.join(FIX)}.")
     return rows
 
 

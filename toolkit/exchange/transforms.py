@@ -21,7 +21,7 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -32,7 +32,6 @@ from toolkit.capture.tables import FARTHEST_M
 from toolkit.errors import CaptureError, ImageError
 from toolkit.exchange.drafts import (
     IMAGE_SUFFIXES,
-    Options,
     every_nth,
     start,
 )
@@ -46,7 +45,7 @@ TOLERANCE = 1e-3  # largest deviation of R^T R from the identity, per element, t
 
 def import_transforms(
     path: str | Path, capture: str | Path, device: str = "ios", split: str = "map", undo_applied: bool = False,
-    own_split: bool = True, **options: Unpack[Options],
+    own_split: bool = True, **options: Any,
 ) -> ImportReport:  # fmt: skip
     """Make a session, or a map and a query session, from a transforms.json. Images keep their `file_path` as names.
 
