@@ -358,12 +358,12 @@ def _shared(
     masks: Masks = None,
     gps: Gps = False,
     positions: Positions = None,
-    timestamps: Annotated[Path | None, Option(metavar="names|FILE", help=_TIMES)] = None,
+    timestamps: Annotated[str | None, Option(metavar="names|FILE", help=_TIMES)] = None,
     timestamps_unit: Annotated[str | None, Option(metavar="s|ms|us|ns", help="Of times that are given.")] = None,
     odometry: Annotated[Path | None, Option(help="The queries' own poses: TUM, EuRoC, KITTI, ARKit.")] = None,
     depth: Annotated[Path | None, Option(metavar="DIR", help="Depth maps: PNG, 16 bits, millimeters.")] = None,
     depth_camera: Annotated[str | None, Option(metavar="'MODEL, W, H, ...'", help="If it is not the image's.")] = None,
-    fixes: Annotated[Path | None, Option(metavar="exif|FILE", help=_FIXES)] = None,
+    fixes: Annotated[str | None, Option(metavar="exif|FILE", help=_FIXES)] = None,
     replace: Replace = False,
     add: Annotated[bool, Option("--add", help="Add the images that the session lacks; the others stay.")] = False,
     as_json: ReportJson = False,
@@ -493,6 +493,7 @@ def reconstruct(
     masks: Masks = None,
     remove: Annotated[str | None, Option(metavar="RECORDING", help=_REMOVE)] = None,
     replace: Replace = False,
+    as_json: ReportJson = False,
 ) -> None:
     """Make a map from photographs or videos without poses, by structure from motion; or add them to the map of CAPTURE.
 
@@ -511,35 +512,38 @@ def reconstruct(
     manifest = Path("data_manifests") / f"{re.sub(r'[^A-Za-z0-9._-]', '-', capture.resolve().name)}.yaml"
     if manifest.exists() and str(capture) not in manifest.read_text(encoding="utf-8"):
         raise ManifestError(f"{manifest} is about another capture. Rename it, or give {capture} another name.")
+    tell = partial(print, file=sys.stderr) if as_json else print
     points: dict[str, Any] = {}
-    option = ""
+    option, report = "", None
     if remove:
-        print(remove_recording(remove, capture, device))
+        tell(remove_recording(remove, capture, device))
     elif (capture / "sessions" / f"{device}_map").exists() and not replace:
         first = {"hold-out": hold_out, "camera": camera, "distance": distance, "positions": positions, "masks": masks}
         if given := next((name for name, value in first.items() if value), None):
             raise ManifestError(f"--{given} is for a new map. {capture} has one, to which the photographs are added.")
-        print(add_recording(photos, capture, device, fps).text())
+        report = add_recording(photos, capture, device, fps)
     else:
         result = reconstruct(
             photos, capture, device, fps, camera, distance, mapper, hold_out=hold_out, positions=positions,
             placing=placing, masks=masks, replace=replace,
         )  # fmt: skip
-        print(result.report.text())
-        points, option = {"points": result.points, "colors": result.colors}, result.camera
+        report, option = result.report, result.camera
+        points = {"points": result.points, "colors": result.colors}
+    if report is not None:
+        print(report.as_json() if as_json else report.text())
     picture = capture / FOLDER / "cameras.png"
     draw_top_view(Capture.open(capture), **points).savefig(picture)
-    print(f"Picture: {picture}")
+    tell(f"Picture: {picture}")
     if not manifest.exists():
         new_manifest(manifest.stem, capture)
-    print(f"Manifest: {manifest}")
-    run_dir = pipeline.run(manifest, only=None if hold_out else pipeline.MAP)
+    tell(f"Manifest: {manifest}")
+    run_dir = pipeline.run(manifest, None if hold_out else pipeline.MAP, say=tell)
     if hold_out:
-        print(f"Report: {run_dir / 'report.html'}")
-    print(f"Localize a photograph: python -m toolkit localize {run_dir} PHOTOGRAPH --picture above.png")
+        tell(f"Report: {run_dir / 'report.html'}")
+    tell(f"Localize a photograph: python -m toolkit localize {run_dir} PHOTOGRAPH --picture above.png")
     if not hold_out:
-        print(f"Or many: python -m toolkit import images QUERIES {capture} --device {device}{option}, and then")
-        print(f"python -m toolkit run {manifest}")
+        tell(f"Or many: python -m toolkit import images QUERIES {capture} --device {device}{option}, and then")
+        tell(f"python -m toolkit run {manifest}")
 
 
 @export_app.command("colmap")

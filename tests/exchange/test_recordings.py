@@ -77,13 +77,15 @@ def test_lists_of_poses_of_the_field_become_maps_and_truth(kind: str, tmp_path: 
         np.testing.assert_allclose(poses, [pose(number) for number in range(4)], rtol=0, atol=1e-9)
         if kind != "kitti":
             assert session.images["timestamp"].iloc[0] == pytest.approx((START_S + 0.004) * 1e6, abs=1)
+    with pytest.raises(ManifestError, match="the images of a map"):
+        import_images(folder, tmp_path / "OTHER", split="map", table=file, truth=file, camera=CAMERA)
     photos(folder, f"rgb/{START_S + 9:.6f}.png")
     if kind == "kitti":
         with pytest.raises(CaptureError, match=r"poses\.txt: found 4 poses of 5 images"):
             import_images(folder, tmp_path / "OTHER", split="map", table=file, camera=CAMERA)
     else:
         report = import_images(folder, tmp_path / "OTHER", split="map", table=file, camera=CAMERA)
-        assert "no pose within 0.02 s" in report.record["left out"][0]["reason"]
+        assert report.record["left out"][0]["reason"] == f"{file}, no pose within 0.02 s"
 
 
 def test_lines_without_names_belong_to_images_by_order_or_number() -> None:
@@ -212,6 +214,10 @@ def test_gps_fixes_of_images_and_of_times(tmp_path: Path) -> None:
     assert gps["latitude_deg"].tolist() == pytest.approx([47.5, 47.5 + 1 / 3600])
     for place in "ABC":
         assert check_capture(tmp_path / place).ok
+    command = ["import", "images", str(folder), str(tmp_path / "E"), "--camera", CAMERA, "--fixes", "exif"]
+    done = CliRunner().invoke(app, [*command, "--timestamps", "names", "--timestamps-unit", "s"])
+    assert done.exit_code == 0, done.output
+    assert "2  fixes, from exif" in done.output
     fixes.write_text("image,latitude,longitude\n0.png,x,8\n")
     with pytest.raises(CaptureError, match=r"fixes\.csv, line 2"):
         import_images(folder, tmp_path / "D", fixes=fixes, **options)

@@ -2,6 +2,7 @@
 
 import json
 import re
+import unicodedata
 from pathlib import Path
 from typing import Any
 
@@ -253,6 +254,17 @@ def test_what_is_malformed_is_named_with_frame_and_key(tmp_path: Path, change: d
     assert status["images/1.jpg"].startswith(f"{file}, frame 1")
     assert message in status["images/1.jpg"]
     assert sorted(status.index[status == "imported"]) == ["images/0.jpg", "images/2.jpg"], "the others go on"
+
+
+@pytest.mark.parametrize(("listed", "stored"), [("NFC", "NFD"), ("NFD", "NFC")])
+def test_names_in_another_encoding_of_letters_are_in_the_file(listed: str, stored: str, tmp_path: Path) -> None:
+    file = write(tmp_path)
+    for k in range(3):
+        name = unicodedata.normalize(stored, f"images/caf\u00e9{k}.jpg")
+        (tmp_path / "images" / f"{k}.jpg").rename(tmp_path / name)
+        file.write_text(file.read_text().replace(f"images/{k}.jpg", unicodedata.normalize(listed, name)))
+    report = import_transforms(file, tmp_path / "PLACE")
+    assert (report.record["used"], report.record["left out"]) == (3, [])
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])

@@ -167,17 +167,17 @@ def import_images(
         rows, draft.listed_in = _read_table(Path(table)), "the table"
     else:
         rows = pd.DataFrame({"image": _listed(draft, folder, only or (), skip or ()), "line": 0})
-    for file, track in zip((table, truth), tracks, strict=True):
-        if track is not None:
-            rows = _with_poses(rows, track, draft, file)
+    if tracks[0] is not None:
+        rows = _with_poses(rows, tracks[0], draft, table)
     if split == "map" and "qw" not in rows:
         given = f"a table with the columns image, {', '.join(POSE_NAMES)}"
         raise CaptureError(f"A map needs poses: give {given}, or import a transforms.json or a COLMAP model.")
     listed_cameras = read_cameras(Path(cameras)) if cameras is not None else {}
     shared_camera = None if camera is None else camera_at("camera", camera)
-    posed = rows if truth is None or tracks[1] is not None else _read_truth(Path(truth), rows, split)
+    posed = rows if truth is None else _read_truth(Path(truth), rows, draft, tracks[1])
     poses = _poses_of(posed, poses_are)
-    bad_poses = {str(row["image"]): f"line {row['line']}: {row['problem']}" for row in _bad(posed).to_dict("records")}
+    bad_poses = {str(row["image"]): (f"line {row['line']}: " if row["line"] else "") + row["problem"]
+                 for row in _bad(posed).to_dict("records")}  # fmt: skip
     if bad_poses and truth is not None:
         first = next(iter(bad_poses.items()))
         draft.notes.append(f"{len(bad_poses)} images have no usable ground truth; first: {first[0]}: {first[1]}")
@@ -358,11 +358,14 @@ def _has_cameras(table: str | Path | None, cameras: str | Path | None) -> bool:
 # Tables
 
 
-def _read_truth(path: Path, images: pd.DataFrame, split: str) -> pd.DataFrame:
-    """Read the table with the ground truth of some of the query `images`."""
-    if split != "query" or "qw" in images:
-        why = "the images of a map" if split != "query" else "images whose table has poses already"
+def _read_truth(path: Path, images: pd.DataFrame, draft: Draft, track: Track | None) -> pd.DataFrame:
+    """Read the table with the ground truth of some of the query `images`; a `track` is its content without names."""
+    is_map = draft.session.name.endswith("_map")
+    if is_map or "qw" in images:
+        why = "the images of a map" if is_map else "images whose table has poses already"
         raise ManifestError(f"truth: {path} is given for {why}. Give it for queries whose table has no poses.")
+    if track is not None:
+        return _with_poses(images, track, draft, path)
     rows = _read_table(path)
     if "qw" not in rows:
         raise CaptureError(f"{path}: no poses in it. Expected the columns image, {', '.join(POSE_NAMES)}.")
