@@ -346,12 +346,13 @@ class Draft(Options):
         if not (self.add and self.session.is_dir()):
             return
         old = Session.open(self.session)
-        known, unit = set(map(own_name, old.image_names)), read_json(self.session / IMPORT_RECORD).get("unit", "m")
+        known, before = set(map(own_name, old.image_names)), read_json(self.session / IMPORT_RECORD)
+        unit = before.get("unit", "m")
         found = self.record.get("unit", unit) if self.poses else unit
         if found != unit:
             units = f"{unit or 'unknown'}, that of the new ones {found or 'unknown'}"
             raise CaptureError(f"{self.session}: the unit of its poses is {units}.")
-        self.record = self.record | {"unit": unit}
+        self.record = {key: before[key] for key in before if key == "meters"} | self.record | {"unit": unit}
         images, self.images = self.images, []
         for image in images:
             if known.isdisjoint((image.name, f"{image.name}.png")):
@@ -513,7 +514,8 @@ class Draft(Options):
             if self.before:
                 _append(made, session)
                 listed = pd.concat([_read_rows(session), table]).drop_duplicates("image", keep="last")
-                record = read_json(session / IMPORT_RECORD) | record | {"before": self.before}
+                old = read_json(session / IMPORT_RECORD)
+                record = old | record | {"before": self.before, "up": old.get("up", record["up"])}
             with write_atomic(session / "proc" / "import.csv") as temporary:
                 listed.to_csv(temporary, index=False)
             if self.placing == "link":

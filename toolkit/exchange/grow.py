@@ -24,7 +24,7 @@ from toolkit.errors import CaptureError
 from toolkit.exchange.drafts import Draft, DraftImage
 from toolkit.exchange.import_report import ImportReport
 from toolkit.exchange.photographs import Photograph, gather, initial_cameras
-from toolkit.exchange.reconstruct import FOLDER, RATIO, RECORD, _hand_over, _Mutual, _quiet, _reasons, _Work
+from toolkit.exchange.reconstruct import FOLDER, RATIO, RECORD, UNIT_HINT, _hand_over, _Mutual, _quiet, _reasons, _Work
 from toolkit.features.features import KINDS
 from toolkit.features.matching import LocalMethod
 from toolkit.features.sift import SiftExtractor
@@ -67,7 +67,8 @@ def add_recording(
     if not added:
         raise CaptureError(f"{sources[0]}: no photograph fits into the model. {next(iter(reasons.items()))}.")
     item_of = dict(zip(work.names, work.photographs, strict=True))
-    report = _append(session, sorted(added, key=lambda image: image.image_id), item_of, reasons)
+    draft = Draft(session, folder, add=True, record={"source": ", ".join(map(str, sources))})
+    report = _append(draft, sorted(added, key=lambda image: image.image_id), item_of, reasons)
     _finish(folder, session, model)
     _hand_over(work, session)
     return report
@@ -191,10 +192,10 @@ def _register(work: _Work, base: pycolmap.Reconstruction, fixed: set[int]) -> py
 
 
 def _append(
-    session: Path, added: Sequence[pycolmap.Image], item_of: Mapping[str, Photograph], reasons: Mapping[str, str]
+    draft: Draft, added: Sequence[pycolmap.Image], item_of: Mapping[str, Photograph], reasons: Mapping[str, str]
 ) -> ImportReport:
     """Add images of the model to a session."""
-    draft = Draft(session, session.parents[1] / FOLDER, add=True, convention="found in the model")
+    draft.convention, draft.unit_hint = "found by structure from motion", UNIT_HINT
     for image in added:
         item, pose = item_of[image.name], image.cam_from_world().inverse()
         assert image.camera is not None

@@ -52,6 +52,7 @@ from toolkit.threads import one_thread
 log = logging.getLogger(__name__)
 
 FOLDER = "reconstruction"
+UNIT_HINT = "If you know a length, give --distance or --positions, or photographs with GPS"
 ALL_PAIRS = 60  # up to this number of photographs, all pairs are matched
 NEIGHBORS, SIMILAR = 10, 20  # else each photograph with so many next ones in its folder, and so many that look similar
 MIN_INLIERS = 15  # of a pair that counts
@@ -415,7 +416,7 @@ def reconstruct(
         "reprojection error, px": error_px, **placed.record,
     }  # fmt: skip
     draft.record |= {"source": ", ".join(map(str, sources)), **placed.record}
-    draft.unit_hint = "If you know a length, give --distance or --positions, or photographs with GPS"
+    draft.unit_hint = UNIT_HINT
     draft.convention = "found by structure from motion"
     draft.notes += [f"{sizes[0]} of {record['photographs']} photographs in the model, {record['points']} points, "
                     f"reprojection error {error_px:.2f} px", *notes]  # fmt: skip
