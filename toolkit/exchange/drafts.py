@@ -364,19 +364,14 @@ class Draft(Options):
         if not is_linked_here(self.session):  # links of others do not become the user's own
             self.placing = "copy"
         self.before, self.old_times = len(known), frozenset(old.images["timestamp"].tolist())
-        in_rigs = set() if old.rigs is None else set(old.rigs["sensor_id"]) | set(old.rigs["rig_id"])
-        ids = list(old.sensors["sensor_id"][old.sensors["sensor_type"] == "camera"])
-        new_id = {camera_text(old.camera(sensor)): sensor for sensor in ids if sensor not in in_rigs}
-        number, taken = len(old.sensors), in_rigs | set(ids)
+        of_rigs = set() if old.rigs is None else set(old.rigs["sensor_id"])
+        cameras = set(old.sensors["sensor_id"][old.sensors["sensor_type"] == "camera"]) - of_rigs
+        equal, suffix = {camera_text(old.camera(sensor)): sensor for sensor in cameras}, f"_{len(known)}"
         for image in self.images:
-            for kind, key in (("cam", image.sensor if image.rig else camera_text(image.camera)), ("rig", image.rig)):
-                while key is not None and key not in new_id:
-                    number += 1
-                    if (name := f"{SUBSESSION}/{kind}_{number}") not in taken:
-                        new_id[key] = name
-            image.sensor = new_id[image.sensor if image.rig else camera_text(image.camera)]
-            image.rig = None if image.rig is None else new_id[image.rig]
-        self.rigs = [(new_id.get(rig, rig), new_id.get(sensor, sensor), pose) for rig, sensor, pose in self.rigs]
+            renamed = f"{image.sensor}{suffix}"
+            image.sensor = renamed if image.rig else equal.get(camera_text(image.camera), renamed)
+            image.rig = None if image.rig is None else f"{image.rig}{suffix}"
+        self.rigs = [(f"{rig}{suffix}", f"{sensor}{suffix}", pose) for rig, sensor, pose in self.rigs]
 
     def source(self, name: str) -> Path:
         """Return the file of an image."""
