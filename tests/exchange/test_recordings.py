@@ -42,12 +42,13 @@ def listed(kind: str, times_s: list[float], poses: list[Floats]) -> str:
     """A list of poses as a tool of this kind writes it."""
     lines = []
     for time_s, one in zip(times_s, poses, strict=True):
-        qw, qx, qy, qz, *xyz = qt_from_pose(one)
+        qw, qx, qy, qz, *xyz = qt_from_pose(one if np.isfinite(one).all() else np.eye(4))
         lines.append(
             {
                 "tum": f"{time_s:.6f} {words(xyz)} {words((qx, qy, qz, qw))}",
                 "euroc": f"{round(time_s * 1e9)},{words((*xyz, qw, qx, qy, qz, *[0] * 9)).replace(' ', ',')}",
                 "euroc8": f"{round(time_s * 1e9)}, {words((*xyz, qw, qx, qy, qz)).replace(' ', ', ')}",
+                "relative": f"{time_s - START_S:.6f},{words((*xyz, qw, qx, qy, qz)).replace(' ', ',')}",
                 "kitti": words(one[:3]),
                 "timed": f"{time_s:.6f} {words(one[:3])}",
                 "rows": f"{time_s:.6f} {words(one)}",
@@ -56,7 +57,7 @@ def listed(kind: str, times_s: list[float], poses: list[Floats]) -> str:
         )
     head = {
         "tum": "# timestamp tx ty tz qx qy qz qw\n", "euroc": "#timestamp, p_RS_R_x [m]\n",
-        "euroc8": "timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z\n",
+        "euroc8": "timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z\n", "relative": "time,px,py,pz,qw,qx,qy,qz\n",
     }  # fmt: skip
     return head.get(kind, "") + "\n".join(lines)
 
@@ -95,13 +96,24 @@ def test_lines_without_names_belong_to_images_by_order_or_number() -> None:
     assert lines_of_images(["a.png"], 5) is None
 
 
-def test_a_malformed_list_of_poses_names_its_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize("bad", ["1305031104.1 1 2 3 0 0 0 2", "1305031104.1 nan 2 3 0 0 0 1", "1305031104.1 1 2"])
+def test_lines_that_are_no_pose_are_counted(bad: str, tmp_path: Path) -> None:
     file = tmp_path / "t.txt"
-    good = listed("tum", [START_S, START_S + 1], [pose(0), pose(1)])
-    for bad, message in (("1305031104.1 1 2 3 0 0 0 2", "no pose"), ("1305031104.1 1 2 3", "expected 8 numbers")):
-        file.write_text(f"{good}\n{bad}\n")
-        with pytest.raises(CaptureError, match=rf"t\.txt, line 4: .*{message}"):
-            read_track(file, None)
+    file.write_text(listed("tum", [START_S, START_S + 1], [pose(0), pose(1)]) + f"\n{bad}\n")
+    track = read_track(file, None)
+    assert track is not None
+    np.testing.assert_allclose(track.poses, [pose(0), pose(1)], rtol=0, atol=1e-9)
+    assert track.note.startswith(f"1 of 3 lines are no pose; first: {file}, line 4: found '{bad}'")
+    file.write_text("\n".join([file.read_text(), bad, bad, bad, bad]))
+    with pytest.raises(CaptureError, match=r"t\.txt, line 4: .*no pose"):
+        read_track(file, None)
+    file.write_text(listed("kitti", [0, 1, 2], [pose(0), np.full((4, 4), np.nan), pose(2)]))
+    folder = photos(tmp_path / "photos", "0.png", "1.png", "2.png")
+    report = import_images(folder, tmp_path / "PLACE", split="map", table=file, camera=CAMERA)
+    assert [(one["first"], one["reason"]) for one in report.record["left out"]] == [
+        ("1.png", f"{file}, its line is no pose")
+    ]
+    assert any("1 of 3 lines are no pose" in note for note in report.notes)
     file.write_text("image,qw\na.jpg,1\n")
     assert read_track(file, None) is None
 
@@ -137,7 +149,7 @@ def test_times_in_a_wrong_unit_are_said(tmp_path: Path) -> None:
         import_images(folder, tmp_path / "OTHER", timestamps_unit="hours", **options)
 
 
-@pytest.mark.parametrize("kind", ["tum", "euroc8", "kitti", "columns"])
+@pytest.mark.parametrize("kind", ["tum", "euroc8", "relative", "kitti", "columns"])
 def test_odometry_becomes_that_of_the_queries(kind: str, tmp_path: Path) -> None:
     folder = photos(tmp_path / "photos", *(f"{number:06d}.png" for number in range(4)))
     times, true = [START_S + number / 10 for number in range(8)], [pose(number) for number in range(8)]
@@ -145,10 +157,11 @@ def test_odometry_becomes_that_of_the_queries(kind: str, tmp_path: Path) -> None
     for one in in_cm:
         one[:3, 3] *= 100
     (tmp_path / "odometry.txt").write_text(listed(kind, times, in_cm))
-    (tmp_path / "times.txt").write_text("".join(f"{time_s:.6f}\n" for time_s in times))
+    begin = START_S if kind == "relative" else 0.0
+    (tmp_path / "times.txt").write_text("".join(f"{time_s - begin:.6f}\n" for time_s in times))
     command = ["import", "images", str(folder), str(tmp_path / "PLACE"), "--camera", CAMERA, "--axes", "opengl"]
     command += ["--unit", "0.01", "--odometry", str(tmp_path / "odometry.txt")]
-    command += ["--timestamps", str(tmp_path / "times.txt")]
+    command += ["--timestamps", str(tmp_path / "times.txt"), "--timestamps-unit", "s"]
     done = CliRunner().invoke(app, command)
     assert done.exit_code == 0, done.output
     session = Capture.open(tmp_path / "PLACE")["ios_query"]

@@ -539,6 +539,7 @@ class Draft(Options):
         if not any(at.min() <= time <= at.max() for time in times.values()):
             span = f"from {at.min()} to {at.max()} us, the images from {min(times.values())} to {max(times.values())}"
             raise CaptureError(f"{self.odometry}: no image was taken in its time: {span}. Give --timestamps.")
+        self.notes += [track.note] if track.note else []
         poses = [posed_camera(pose, self.axes, self.unit_m or 1.0) for pose in track.poses]
         return Trajectory.from_poses(at, [self.images[0].device] * len(at), np.stack(poses))
 

@@ -450,10 +450,14 @@ def _with_poses(rows: pd.DataFrame, track: Track, draft: Draft, file: object) ->
     elif not at:
         found = f"found {len(track.poses)} poses of {len(names)} images in {draft.folder}"
         raise CaptureError(f"{file}: {found}, expected one each, or numbers in their names.")
-    draft.notes.append(f"{file}: poses as of {track.kind}, without names of images")
-    qt = np.array([np.full(7, np.nan) if one is None else qt_from_pose(track.poses[one]) for one in at])
+    draft.notes += [f"{file}: poses as of {track.kind}, without names of images", *([track.note] if track.note else [])]
+    poses = np.stack([np.full((4, 4), np.nan) if one is None else track.poses[one] for one in at])
+    known = np.isfinite(poses).all(axis=(1, 2))
+    qt = np.full((len(names), 7), np.nan)
+    qt[known] = qt_from_pose(poses[known])
+    why = "its line is no pose" if track.times_us is None else f"no pose within {MAX_OFFSET_S:g} s"
     rows = rows.assign(**dict(zip(POSE_NAMES, qt.T, strict=True)))
-    return rows.assign(problem=["" if one is not None else f"no pose within {MAX_OFFSET_S:g} s" for one in at])
+    return rows.assign(problem=["" if is_known else why for is_known in known])
 
 
 def _read_hloc_list(text: str) -> pd.DataFrame:

@@ -5,6 +5,7 @@ import io
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -32,8 +33,9 @@ class Track:
     """Poses over time, in the direction and unit of their file, N of them in order of time."""
 
     times_us: Ints | None  # (N,); None: one per image
-    poses: Floats  # (N, 4, 4)
+    poses: Floats  # (N, 4, 4); NaN for a line that is no pose, if there are no times
     kind: str  # the format
+    note: str = ""  # lines that are no pose
 
     def nearest(self, time_us: int) -> int | None:
         """Return the pose that is nearest to a time; None if none is within `MAX_OFFSET_S`."""
@@ -108,7 +110,7 @@ def numbers_of(where: str, words: Sequence[str], count: int) -> Floats:
     raise CaptureError(f"{where}: found {' '.join(words)[:80]!r}, expected {count} numbers.")
 
 
-def to_us(times: Iterable[str], unit: str | None, where: object, near_us: Iterable[int] = ()) -> Ints:
+def to_us(times: Iterable[str | float], unit: str | None, where: object, near_us: Iterable[int] = ()) -> Ints:
     """Return times (N,) in microseconds.
 
     Args:
@@ -116,11 +118,14 @@ def to_us(times: Iterable[str], unit: str | None, where: object, near_us: Iterab
         near_us: times of images; the unit is that in which most of them are among the given times, if any is.
 
     Raises:
+        CaptureError: a time is not finite.
         ManifestError: an unknown unit, or it is not known.
     """
     if unit is not None and unit not in UNITS_US:
         raise ManifestError(f"timestamps-unit: found {unit!r}, expected one of {', '.join(UNITS_US)}.")
     values, near = np.array([float(time) for time in times]), np.array([*near_us])
+    if not np.isfinite(values).all():
+        raise CaptureError(f"{where}: found a time that is not a finite number.")
     typical = float(np.median(values)) if len(values) else 0.0
     within = {name: np.sum((values.min() * scale <= near) & (near <= values.max() * scale)) if len(values) else 0
               for name, scale in UNITS_US.items()}  # fmt: skip
@@ -184,36 +189,50 @@ def read_track(
         times: file with a time per line, for lists that have none.
 
     Raises:
-        CaptureError: the file cannot be read, or a line differs from the first or is no pose.
+        CaptureError: the file cannot be read, or most lines are no poses.
         ManifestError: see `to_us`.
     """
-    rows = list(lines_of(path))
+    lines, head = lines_of(path), read_text(path, "replace").partition("\n")[0]
+    rows = list(islice(lines, 2))
     if rows and "image" not in rows[0][1] and not is_number(rows[0][1][0]):  # a header
         del rows[0]
     count = len(rows[0][1]) if rows else 0
     if count not in (8, 12, 13, 17) or not all(map(is_number, rows[0][1])):
         return None
-    table = np.array([numbers_of(where, words, count) for where, words in rows])
-    words = [words[0] for _, words in (rows if count > 12 or count == 8 else lines_of(times) if times else ())]
-    at = to_us(words, unit, path, near_us) if len(words) == len(rows) else None
+    rows += lines
+    whole = [words if len(words) == count and all(map(is_number, words)) else ["nan"] * count for _, words in rows]
+    table = np.array(whole, np.float64)
     matrices = table if count == 12 else table[:, 1:]
-    if count == 17 and np.allclose(matrices[:, [3, 7, 11, 15]], [0, 0, 0, 1]):
+    if count == 17 and np.allclose(matrices[0, [3, 7, 11, 15]], [0, 0, 0, 1]):
         poses, kind = matrices.reshape(-1, 4, 4).swapaxes(1, 2), "4 x 4 matrices, column by column"
-    elif count == 17 and np.allclose(matrices[:, 12:], [0, 0, 0, 1]):
+    elif count == 17 and np.allclose(matrices[0, 12:], [0, 0, 0, 1]):
         poses, kind = matrices.reshape(-1, 4, 4), "4 x 4 matrices"
     elif count in (12, 13):
         rotations = matrices.reshape(-1, 3, 4)
         poses, kind = make_pose(rotations[:, :, :3], rotations[:, :, 3]), "3 x 4 matrices (KITTI)"
     else:
-        w_first = count == 17 or table[0, 0] > _SINCE_2001_US * 1e3
-        poses = pose_from_qt(table[:, [4, 5, 6, 7, 1, 2, 3] if w_first else [7, 4, 5, 6, 1, 2, 3]])
-        kind = "EuRoC" if w_first else "TUM"
-    determinants = np.linalg.det(poses[:, :3, :3])
-    lengths = np.linalg.norm(table[:, 4:8], axis=1) if kind in ("EuRoC", "TUM") else np.cbrt(determinants)
-    for row in np.flatnonzero(~(np.abs(lengths - 1) <= NORM_TOLERANCE)).tolist():
-        raise CaptureError(f"{rows[row][0]}: found {' '.join(rows[row][1])[:80]!r}, which is no pose.")
-    order = np.argsort(at, kind="stable") if at is not None else np.arange(len(rows))
-    return Track(None if at is None else at[order], poses[order], kind)
+        in_head = re.search(r"q\w*w\b.*\bq\w*x", head) is not None
+        w_first = count == 17 or in_head or table[0, 0] > _SINCE_2001_US * 1e3
+        poses, kind = np.full((len(rows), 4, 4), np.nan), "EuRoC" if w_first else "TUM"
+        qt = table[:, [4, 5, 6, 7, 1, 2, 3] if w_first else [7, 4, 5, 6, 1, 2, 3]]
+        unit_length = np.abs(np.linalg.norm(qt[:, :4], axis=1) - 1) <= NORM_TOLERANCE
+        poses[unit_length] = pose_from_qt(qt[unit_length])
+    sizes = np.cbrt(np.linalg.det(np.nan_to_num(poses[:, :3, :3])))
+    valid = np.isfinite(poses).all(axis=(1, 2)) & (np.abs(sizes - 1) <= NORM_TOLERANCE)
+    bad = [f"{where}: found {' '.join(words)[:80]!r}" for (where, words), is_pose in zip(rows, valid, strict=True)
+           if not is_pose]  # fmt: skip
+    if len(bad) > len(rows) / 2:
+        raise CaptureError(f"{bad[0]}, which is no pose, as of {kind}.")
+    note = f"{len(bad)} of {len(rows)} lines are no pose; first: {bad[0]}" if bad else ""
+    stamps = table[:, 0] if count > 12 or count == 8 else np.array(
+        [float(words[0]) for _, words in lines_of(times) if is_number(words[0])] if times is not None else []
+    )  # fmt: skip
+    if len(stamps) != len(rows):
+        poses[~valid] = np.nan
+        return Track(None, poses, kind, note)
+    at = to_us(stamps[valid], unit, path, near_us)
+    order = np.argsort(at, kind="stable")
+    return Track(at[order], poses[valid][order], kind, note)
 
 
 def read_fixes(path: Path) -> pd.DataFrame:
