@@ -468,11 +468,20 @@ def import_dataset(
     from toolkit.exchange.datasets import LAYOUTS, import_dataset
     from toolkit.exchange.new_manifest import new_manifest
 
+    manifest = _manifest_of(capture)
     report = import_dataset(kind, path, capture, scene, every=every, **options)
-    name = re.sub(r"[^A-Za-z0-9._-]", "-", capture.resolve().name)
-    manifest = new_manifest(name, capture, thresholds=LAYOUTS[kind].thresholds)
+    if not manifest.exists():
+        new_manifest(manifest.stem, capture, thresholds=LAYOUTS[kind].thresholds)
     print(f"Run it: python -m toolkit run {manifest}", file=sys.stderr)
     return report
+
+
+def _manifest_of(capture: Path) -> Path:
+    """Return the manifest of a capture, which may not exist. Raise ManifestError if it is about another one."""
+    manifest = Path("data_manifests") / f"{re.sub(r'[^A-Za-z0-9._-]', '-', capture.resolve().name)}.yaml"
+    if manifest.exists() and str(capture) not in manifest.read_text(encoding="utf-8"):
+        raise ManifestError(f"{manifest} is about another capture. Rename it, or give {capture} another name.")
+    return manifest
 
 
 @app.command()
@@ -509,9 +518,7 @@ def reconstruct(
     if (len(sources) != 1) if remove else (len(sources) < 2):
         raise ManifestError("reconstruct: expected photographs and then the folder of the new capture.")
     *photos, capture = sources
-    manifest = Path("data_manifests") / f"{re.sub(r'[^A-Za-z0-9._-]', '-', capture.resolve().name)}.yaml"
-    if manifest.exists() and str(capture) not in manifest.read_text(encoding="utf-8"):
-        raise ManifestError(f"{manifest} is about another capture. Rename it, or give {capture} another name.")
+    manifest = _manifest_of(capture)
     tell = partial(print, file=sys.stderr) if as_json else print
     points: dict[str, Any] = {}
     option, report = "", None

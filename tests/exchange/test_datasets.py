@@ -190,6 +190,8 @@ def test_a_data_set_becomes_a_capture_with_its_poses_and_thresholds(
         np.testing.assert_allclose(found[match], expected, rtol=0, atol=1e-9)
     manifest = yaml.safe_load(Path("data_manifests/PLACE.yaml").read_text())
     assert manifest["evaluate"]["thresholds"] == [list(limit) for limit in LAYOUTS[kind].thresholds]
+    assert CliRunner().invoke(app, command).exit_code == 1
+    assert CliRunner().invoke(app, [*command, "--replace"]).exit_code == 0
 
 
 def test_images_without_a_pose_are_rows(tmp_path: Path) -> None:

@@ -287,7 +287,7 @@ class _SessionCheck:
             self.missing[file] += int(gone.sum())
             lost = os.readlink(f"{self.session.path}/{RAW_DATA}/{listed[gone][0]}")  # noqa: PTH115
             found = f"{gone.sum()} of {len(rows)} files are links to files that are gone, such as {lost}"
-            do = "Move them back, or remove the session and import again; --images copy does not depend on them"
+            do = "Move them back, or import again with --replace; --images copy does not depend on them"
             self._add(file, int(rows.index[gone][0]), f"{found}. {do}")
         self._check_content(file, rows[exist & inside & ~gone])
 

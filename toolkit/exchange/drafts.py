@@ -477,7 +477,8 @@ class Draft(Options):
         self.rows = [row | {"image": printable(row["image"]), "status": printable(row["status"])} for row in self.rows]
         table = pd.DataFrame(self.rows, columns=columns).astype({"timestamp": "Int64"})
         posed = list(self._camera_poses(self.images[:: max(1, len(self.images) // _MOST_FOR_UP)]).values())
-        up = ", ".join(f"{value + 0.0:.2f}" for value in up_of_cameras(posed)) if posed else ""
+        axis = ", ".join(f"{value + 0.0:.2f}" for value in up_of_cameras(posed))
+        by = f"z, {self.record['up']}" if "up" in self.record else f"({axis}), as most cameras are held"
         record = {
             "unit": self.record.get("unit", "m"), "source": str(self.folder), "used": len(self.images),
             "seen": len(self.images) + len(left_out),
@@ -486,11 +487,10 @@ class Draft(Options):
             "poses": len(self.poses), "convention": f"{self.convention}, {_AXES[self.axes]}",
             "unit from": self.record.get("meters", self.unit_hint), "timestamps": [len(times), self.times_from],
             "masks": [len(masks), "no features where they are black"] if masks else None, "notes": self.notes,
-        } | self.record  # fmt: skip
-        record["up"] = f"z, {record['up']}" if "up" in record else f"({up}), as most cameras are held"
-        record["odometry"] = [len(odometry), f"poses, from {self.odometry}"] if odometry is not None else None
-        record["GPS"] = [len(fixes), f"fixes, from {self.fixes}"] if fixes else None
-        record["depth maps"] = [len(depths), f"from {self.depth}"] if depths else None
+                    "odometry": [len(odometry), f"poses, from {self.odometry}"] if odometry is not None else None,
+            "GPS": [len(fixes), f"fixes, from {self.fixes}"] if fixes else None,
+            "depth maps": [len(depths), f"from {self.depth}"] if depths else None,
+        } | self.record | {"up": by if posed else None}  # fmt: skip
         with write_folder(self.session, self.replace or self.add, keep=self.add) as session:
             files = [(self.source(image.name), session / RAW_DATA / image.path) for image in self.images]
             files += [(path, session / MASKS / f"{IMPORTED}{name}.png") for name, path in masks.items()]
