@@ -9,9 +9,8 @@ TUM RGB-D (J. Sturm et al., IROS 2012), KITTI odometry (A. Geiger et al., CVPR 2
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
@@ -39,31 +38,22 @@ _TUM = {
 """Intrinsics of the color cameras, from the data set's page."""
 
 
-@dataclass(frozen=True)
-class Photograph:
+class Photograph(NamedTuple):
     """An image of a data set."""
 
-    name: str
-    """Path in the folder of the images."""
-    split: str
-    """`map` or `query`; empty if the data set has no split."""
-    camera: pycolmap.Camera | str
-    """Intrinsics, or why there are none."""
-    pose: Floats | str | None
-    """world_from_cam (4, 4), meters; None: not published; or why there is none."""
+    name: str  # path in the folder of the images
+    split: str  # `map` or `query`; empty if the data set has no split
+    camera: pycolmap.Camera | str  # intrinsics, or why there are none
+    pose: Floats | str | None  # world_from_cam (4, 4), meters; None: not published; or why there is none
     time_us: int | None = None
 
 
-@dataclass(frozen=True)
-class Layout:
+class Layout(NamedTuple):
     """How a data set is read."""
 
-    read: Callable[[Path], tuple[Path, list[Photograph]]]
-    """Takes the folder of a scene; returns the folder of its images, and the images."""
-    thresholds: Sequence[tuple[float, float]]
-    """Of recall, as usual for the data set: degrees, meters."""
-    example: str
-    """A file that tells a scene's folder."""
+    read: Callable[[Path], tuple[Path, list[Photograph]]]  # from a scene's folder: the folder of its images, and these
+    thresholds: Sequence[tuple[float, float]]  # of recall, as usual for the data set: degrees, meters
+    example: str  # a file that tells a scene's folder
 
 
 def import_dataset(
