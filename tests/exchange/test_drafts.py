@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -80,26 +81,30 @@ def test_reasons_that_differ_in_numbers_are_one() -> None:
     assert [(one["count"], one["first"]) for one in grouped(rows)] == [(3, "0.jpg"), (1, "x.jpg")]
 
 
-@pytest.mark.parametrize("placing", ["link", "copy"])
-def test_images_are_added_and_the_others_stay(placing: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("before", "placing", "linked"),
+    [("link", "link", [True, True]), ("copy", "link", [False, False]), ("link", "copy", [True, False])],
+)
+def test_images_are_added_and_the_others_stay(before: str, placing: str, linked: list[bool], tmp_path: Path) -> None:
     first, more = photos(tmp_path / "first", "a.jpg", "b.jpg"), photos(tmp_path / "more", "b.jpg", "c.jpg", "d.jpg")
-    options = {"split": "map", "placing": placing}
     listed = table(tmp_path / "1.csv", "a.jpg", "b.jpg")
+    options: dict[str, Any] = {"split": "map", "placing": before}
     session = import_images(first, tmp_path / "PLACE", table=listed, camera=CAMERA, **options).session
+    options["placing"] = placing
     (session / "proc" / "features").mkdir()
     (session / "proc" / "features" / "of_a.shard").write_bytes(b"made by a run")
-    before = texts(session)
+    old = texts(session)
     listed = table(tmp_path / "2.csv", "b.jpg", "c.jpg", "d.jpg")
     report = import_images(more, tmp_path / "PLACE", table=listed, camera=OTHER_CAMERA, add=True, **options)
     assert (report.record["before"], report.record["used"]) == (2, 2)
     assert [(one["reason"], one["first"]) for one in report.record["left out"]] == [("in the session already", "b.jpg")]
     after = texts(session)
-    assert all(after[name].startswith(before[name]) for name in before if name != "proc/links.txt")
+    assert all(after[name].startswith(old[name]) for name in old if name != "proc/links.txt")
     opened = Capture.open(tmp_path / "PLACE")["ios_map"]
     assert [Path(path).name for path in opened.images["path"]] == ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
     assert [opened.camera(sensor).params[0] for sensor in opened.images["sensor_id"]] == [50, 50, 60, 60]
     assert opened.world_from_cam()[:, 0, 3].tolist() == [0, 1, 1, 2]
-    assert opened.image_path(3).is_symlink() == (placing == "link")
+    assert [opened.image_path(row).is_symlink() for row in (0, 3)] == linked
     assert (session / "proc" / "features" / "of_a.shard").read_bytes() == b"made by a run"
     assert check_capture(tmp_path / "PLACE").ok
     with pytest.raises(CaptureError, match="has all 3 images already"):

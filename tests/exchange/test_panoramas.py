@@ -77,6 +77,24 @@ def test_views_see_the_directions_of_the_panorama(tmp_path: Path) -> None:
     assert sum(session.mask_path(row) is not None for row in range(len(session.images))) == len(YAWS_DEG)
 
 
+def test_times_and_odometry_are_those_of_the_panoramas(tmp_path: Path) -> None:
+    for name in ("17.png", "18.png"):
+        save_panorama(tmp_path / "photos" / name)
+    (tmp_path / "odometry.txt").write_text("17 0 0 0 0 0 0 1\n18 1 0 0 0 0 0 1\n")
+    (tmp_path / "gps.csv").write_text("image,latitude,longitude\n18.png,47,8\n")
+    import_panoramas(
+        tmp_path / "photos", tmp_path / "CAP", timestamps="names", timestamps_unit="s",
+        odometry=tmp_path / "odometry.txt", fixes=tmp_path / "gps.csv",
+    )  # fmt: skip
+    session = Capture.open(tmp_path / "CAP")["ios_query"]
+    assert sorted(set(session.images["timestamp"])) == [17_000_000, 18_000_000]
+    assert session.odometry is not None
+    assert session.odometry.timestamps.tolist() == [17_000_000, 18_000_000]
+    assert set(session.odometry.device_ids) == set(session.device_ids)
+    assert session.gps is not None
+    assert session.gps["timestamp"].tolist() == [18_000_000]
+
+
 def test_what_is_refused(tmp_path: Path) -> None:
     save_panorama(tmp_path / "photos/1.png")
     with pytest.raises(CaptureError, match="A map needs poses"):

@@ -177,6 +177,7 @@ class Draft(Options):
     convention: str = "world_from_cam"  # of the poses as they were given
     unit_hint: str = "If you know it, give --unit METERS (1 if a phone's tracking or a scanner gave the poses)"
     listed_in: str = ""  # what names the images; those of the folder that it does not name are counted; empty: none
+    frames_are_names: bool = True  # of images, or of the panoramas that these are cut from
     beside: bool = False  # count only those in the same folders
     others: dict[str, list[str]] = field(default_factory=dict)  # files that are no row, by the reason
     notes: list[str] = field(default_factory=list)
@@ -257,9 +258,10 @@ class Draft(Options):
         """Give images the times of `timestamps`, and leave out those without one."""
         if self.timestamps is None:
             return
-        times = read_times(self.timestamps, sorted(image.name for image in self.images), self.timestamps_unit)
+        name_of = {image.name: image.frame if self.frames_are_names else image.name for image in self.images}
+        times = read_times(self.timestamps, sorted(set(name_of.values())), self.timestamps_unit)
         for image in self.images:
-            image.time_us = times.get(image.name)
+            image.time_us = times.get(name_of[image.name])
         why = "no time in its name" if self.timestamps == NAMES else f"no time in {self.timestamps}"
         self.rows += [{"image": image.name, "status": why} for image in self.images if image.time_us is None]
         self.images = [image for image in self.images if image.time_us is not None]
@@ -513,7 +515,7 @@ class Draft(Options):
                 record = old | record | {"before": self.before, "up": old.get("up", record["up"])}
             with write_atomic(session / "proc" / "import.csv") as temporary:
                 listed.to_csv(temporary, index=False)
-            if self.placing == "link":
+            if self.placing == "link" or (self.before and is_linked_here(self.session)):
                 note_linked_here(session)
             record["seconds"] = round(time.perf_counter() - self.started, 3)
             write_text(session / IMPORT_RECORD, json.dumps(record, indent=1) + "\n")
@@ -547,7 +549,7 @@ class Draft(Options):
         """Return the rows of gps.txt."""
         if self.fixes is None:
             return []
-        fixes, of_image = self._fixes(), {image.name: times[image.frame] for image in self.images}
+        fixes, of_image = self._fixes(), {**times, **{image.name: times[image.frame] for image in self.images}}
         timed = fixes[fixes["timestamp"] != ""]
         named = fixes[(fixes["timestamp"] == "") & fixes["image"].isin(of_image.keys())]
         at = to_us(timed["timestamp"], self.timestamps_unit, self.fixes, times.values()).tolist() if len(timed) else []

@@ -84,6 +84,7 @@ def import_colmap(
     content = read_model(Path(model))
     draft.notes += content.notes
     draft.convention, draft.listed_in = "cam_from_world of the model", "the model"
+    draft.frames_are_names = False
     rig_of_image = {
         image_id: (frame_id, frame)
         for frame_id, frame in content.frames.items()
