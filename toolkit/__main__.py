@@ -335,7 +335,7 @@ def importer(name: str) -> Callable[[Callable[..., Any]], None]:
 
     def register(command: Callable[..., Any]) -> None:
         own, shared = inspect.signature(command, eval_str=True), inspect.signature(_shared, eval_str=True)
-        parameters = {**own.parameters, **shared.parameters}
+        parameters = {**own.parameters, **shared.parameters, **own.parameters}  # its own come first, and win
         del parameters["options"]
 
         @wraps(command)
@@ -462,6 +462,7 @@ def import_dataset(
     capture: Annotated[Path, Argument(help="New capture folder, with a map and a query session.")],
     scene: Annotated[str | None, Option(help="Scene below PATH, e.g. chess.")] = None,
     every: Annotated[int, Option(min=1, metavar="N", help="Take every Nth image of each folder.")] = 1,
+    hold_out: Annotated[int, Option(min=2, metavar="N", help="Every Nth image is a query, without a split.")] = 8,
     **options: Any,
 ) -> Any:
     """Make a map and queries from a data set of the field, and a manifest with its thresholds."""
@@ -469,7 +470,7 @@ def import_dataset(
     from toolkit.exchange.new_manifest import new_manifest
 
     manifest = _manifest_of(capture)
-    report = import_dataset(kind, path, capture, scene, every=every, **options)
+    report = import_dataset(kind, path, capture, scene, every=every, hold_out=hold_out, **options)
     if not manifest.exists():
         new_manifest(manifest.stem, capture, thresholds=LAYOUTS[kind].thresholds)
     print(f"Run it: python -m toolkit run {manifest}", file=sys.stderr)

@@ -91,6 +91,7 @@ def test_lists_of_poses_of_the_field_become_maps_and_truth(kind: str, tmp_path: 
 
 def test_lines_without_names_belong_to_images_by_order_or_number() -> None:
     assert lines_of_images(["c.png", "a.png", "b.png"], 3) == [2, 0, 1]
+    assert lines_of_images(["10.png", "9.png", "a/1.png"], 3) == [1, 0, 2]
     assert lines_of_images(["image_0/000004.png", "image_0/000000.png"], 5) == [4, 0]
     assert lines_of_images(["000004.png", "000005.png"], 5) is None
     assert lines_of_images(["a.png"], 5) is None
@@ -133,6 +134,12 @@ def test_the_unit_of_times_is_told_by_their_size_or_given(unit: str, scale: floa
     assert read_times(file, listed_names, unit) == {name: k * 100_000 for k, name in enumerate(listed_names)}
     file.write_text("".join(f"{scale * number / 10:e}\n" for number in range(3)))  # KITTI's times.txt
     assert read_times(file, listed_names, unit) == {name: k * 100_000 for k, name in enumerate(listed_names)}
+
+
+def test_names_that_end_alike_are_not_confused(tmp_path: Path) -> None:
+    file, names = tmp_path / "times.txt", ["cam0/1.png", "cam1/1.png", "cam1/2.png"]
+    file.write_text("1 1.png\n2 2.png\n3 cam0/1.png\n")
+    assert read_times(file, names, "s") == {"cam1/2.png": 2_000_000, "cam0/1.png": 3_000_000}
 
 
 def test_times_in_a_wrong_unit_are_said(tmp_path: Path) -> None:

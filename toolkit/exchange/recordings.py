@@ -3,6 +3,7 @@
 import csv
 import io
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -155,7 +156,9 @@ def read_times(source: str | Path, names: Sequence[str], unit: str | None) -> di
         rows = [words for _, words in lines_of(Path(source)) if any(map(is_number, words))]
         if all(len(words) == 1 for words in rows) and (lines := lines_of_images(names, len(rows))) is not None:
             found = {name: rows[line][0] for name, line in zip(names, lines, strict=True)}
-        by_end = {PurePosixPath(name).name: name for name in names} | {name: name for name in names}
+        ends = Counter(PurePosixPath(name).name for name in names)
+        by_end = {end: name for name in names if ends[end := PurePosixPath(name).name] == 1}
+        by_end |= {name: name for name in names}
         for first, *rest in (words for words in rows if len(words) > 1):
             time, name = (first, " ".join(rest)) if is_number(first) else (rest[-1], " ".join([first, *rest[:-1]]))
             if (listed := by_end.get(name) or by_end.get(PurePosixPath(name).name)) and is_number(time):
@@ -166,10 +169,12 @@ def read_times(source: str | Path, names: Sequence[str], unit: str | None) -> di
 
 
 def lines_of_images(names: Sequence[str], count: int) -> list[int] | None:
-    """Return the line, from 0, of each image in a file of `count` lines without names: in order of the names, or else
-    that of the last number in its name; None if neither is possible."""
+    """Return the line, from 0, of each image in a file of `count` lines without names: in order of the names, where 2
+    comes before 10, or else that of the last number in its name; None if neither is possible."""
     if len(names) == count:
-        return np.argsort(np.argsort(names, kind="stable"), kind="stable").tolist()
+        parts = {name: [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)] for name in names}
+        place = {name: line for line, name in enumerate(sorted(names, key=lambda name: parts[name]))}
+        return [place[name] for name in names]
     numbers = [re.findall(r"\d+", _stem(name)) for name in names]
     lines = [int(found[-1]) for found in numbers if found]
     return lines if len(set(lines)) == len(names) and max(lines) < count else None
