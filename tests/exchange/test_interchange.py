@@ -683,3 +683,24 @@ def test_the_command_line_imports(model: Path, tmp_path: Path) -> None:
     poses = Capture.open(place)["spot_map"].trajectory
     assert poses is not None
     np.testing.assert_allclose(pose_from_qt(poses.qt)[0, 3], [0, 0, 0, 1])
+
+
+def test_a_model_with_rigs_is_added_to_a_session(model: Path, tmp_path: Path) -> None:
+    later = tmp_path / "later"
+    for name in ("phone/2.jpg", "rig/5.jpg"):
+        (later / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "photos" / name).rename(later / name)
+    import_colmap(model, tmp_path / "photos", tmp_path / "PLACE", device="hl", unit_m=1.0)
+    report = import_colmap(model, later, tmp_path / "PLACE", device="hl", unit_m=1.0, add=True)
+    assert (report.record["before"], report.record["used"]) == (3, 2)
+    session, reference = Capture.open(tmp_path / "PLACE")["hl_map"], pycolmap.Reconstruction(str(model))
+    for name, world_from_cam in poses_of(session).items():
+        cam_from_world = reference.find_image_with_name(name).cam_from_world()
+        expected = invert(make_pose(cam_from_world.rotation.matrix(), cam_from_world.translation))
+        np.testing.assert_allclose(world_from_cam, expected, rtol=0, atol=1e-9)
+    assert len(session.images) == 5
+    assert session.rigs is not None
+    assert sorted(set(session.rigs["rig_id"])) == ["import/rig_7", "import/rig_7_3"]
+    cameras = session.images.set_index("path")["sensor_id"]
+    assert cameras["import/images/phone/2.jpg"] == cameras["import/images/phone/1.jpg"]
+    assert check_capture(tmp_path / "PLACE").problems == []
