@@ -97,7 +97,10 @@ def test_lines_without_names_belong_to_images_by_order_or_number() -> None:
     assert lines_of_images(["a.png"], 5) is None
 
 
-@pytest.mark.parametrize("bad", ["1305031104.1 1 2 3 0 0 0 2", "1305031104.1 nan 2 3 0 0 0 1", "1305031104.1 1 2"])
+@pytest.mark.parametrize(
+    "bad",
+    ["1305031104.1 1 2 3 0 0 0 2", "1305031104.1 nan 2 3 0 0 0 1", "1305031104.1 1e20 2 3 0 0 0 1", "1305031104.1 1 2"],
+)
 def test_lines_that_are_no_pose_are_counted(bad: str, tmp_path: Path) -> None:
     file = tmp_path / "t.txt"
     file.write_text(listed("tum", [START_S, START_S + 1], [pose(0), pose(1)]) + f"\n{bad}\n")
@@ -181,6 +184,15 @@ def test_odometry_becomes_that_of_the_queries(kind: str, tmp_path: Path) -> None
     assert f"8  poses, from {tmp_path / 'odometry.txt'}" in done.output
 
 
+def test_a_time_again_counts_once(tmp_path: Path) -> None:
+    file = tmp_path / "t.txt"
+    file.write_text(listed("tum", [START_S + 1, START_S, START_S], [pose(0), pose(1), pose(2)]))
+    track = read_track(file, None)
+    assert track is not None
+    np.testing.assert_allclose(track.poses, [pose(1), pose(0)], rtol=0, atol=1e-9)
+    assert track.note == "1 lines repeat a time, of which the first counts"
+
+
 def test_odometry_that_cannot_be_used_is_refused(tmp_path: Path) -> None:
     folder = photos(tmp_path / "photos", "0.png", "1.png")
     times, file = tmp_path / "times.txt", tmp_path / "odometry.txt"
@@ -238,8 +250,12 @@ def test_gps_fixes_of_images_and_of_times(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, [*command, "--timestamps", "names", "--timestamps-unit", "s"])
     assert done.exit_code == 0, done.output
     assert "2  fixes, from exif" in done.output
-    fixes.write_text("image,latitude,longitude\n0.png,x,8\n")
-    with pytest.raises(CaptureError, match=r"fixes\.csv, line 2"):
+    for bad in ("image,latitude,longitude\n0.png,x,8\n", "image,latitude,longitude\n0.png,91,8\n", "latitude\n47\n"):
+        fixes.write_text(bad)
+        with pytest.raises(CaptureError, match=r"fixes\.csv, line 2"):
+            import_images(folder, tmp_path / "D", fixes=fixes, **options)
+    fixes.write_text("timestamp,latitude,longitude\n1.7F9,47,8\n")
+    with pytest.raises(CaptureError, match=r"fixes\.csv: found the time '1.7F9'"):
         import_images(folder, tmp_path / "D", fixes=fixes, **options)
 
 

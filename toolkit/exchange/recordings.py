@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import pandas as pd
 
+from toolkit.capture.tables import FARTHEST_M
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.colmap_model import NORM_TOLERANCE, encoding_of, is_number
 from toolkit.geometry import Floats, Ints, make_pose, pose_from_qt
@@ -27,6 +28,7 @@ FIX = ("latitude", "longitude", "altitude", "accuracy")
 NAMES = "names"
 """What is given for a file of times if the times are the last numbers in the names of the images."""
 _SINCE_2001_US, _UNTIL_2096_US = 1e15, 4e15
+_LAST = 4e18  # of any unit, in nanoseconds
 
 
 @dataclass(frozen=True)
@@ -62,8 +64,8 @@ def read_text(path: Path, errors: str = "strict") -> str:
 def lines_of(path: Path) -> Iterator[tuple[str, list[str]]]:
     """Return place and words of the lines of a text file, see `read_text`, that are neither empty nor comments."""
     for number, line in enumerate(read_text(path, "replace").splitlines(), start=1):
-        if line.strip() and not line.startswith("#"):
-            yield f"{path}, line {number}", line.replace(",", " ").split()
+        if not line.startswith("#") and (words := line.replace(",", " ").split()):
+            yield f"{path}, line {number}", words
 
 
 def read_csv(path: Path) -> pd.DataFrame:
@@ -119,14 +121,15 @@ def to_us(times: Iterable[str | float], unit: str | None, where: object, near_us
         near_us: times of images; the unit is that in which most of them are among the given times, if any is.
 
     Raises:
-        CaptureError: a time is not finite.
+        CaptureError: a time is no number.
         ManifestError: an unknown unit, or it is not known.
     """
     if unit is not None and unit not in UNITS_US:
         raise ManifestError(f"timestamps-unit: found {unit!r}, expected one of {', '.join(UNITS_US)}.")
-    values, near = np.array([float(time) for time in times]), np.array([*near_us])
-    if not np.isfinite(values).all():
-        raise CaptureError(f"{where}: found a time that is not a finite number.")
+    given, near = pd.Series([*times], dtype=object), np.array([*near_us])
+    values = pd.to_numeric(given, errors="coerce").to_numpy(float)
+    for time in given[~(np.abs(values) < _LAST)]:
+        raise CaptureError(f"{where}: found the time {time!r}, expected a number.")
     typical = float(np.median(values)) if len(values) else 0.0
     within = {name: np.sum((values.min() * scale <= near) & (near <= values.max() * scale)) if len(values) else 0
               for name, scale in UNITS_US.items()}  # fmt: skip
@@ -134,7 +137,7 @@ def to_us(times: Iterable[str | float], unit: str | None, where: object, near_us
     fitting = [name for name, scale in UNITS_US.items() if _SINCE_2001_US <= typical * scale <= _UNTIL_2096_US]
     if unit is None and not fitting:
         raise ManifestError(f"{where}: found times such as {typical:.10g}. Give --timestamps-unit s, ms, us or ns.")
-    return np.round(values * UNITS_US[unit or fitting[0]]).astype(np.int64)
+    return np.round(np.clip(values * UNITS_US[unit or fitting[0]], -_LAST, _LAST)).astype(np.int64)
 
 
 def read_times(source: str | Path, names: Sequence[str], unit: str | None) -> dict[str, int]:
@@ -223,7 +226,7 @@ def read_track(
         unit_length = np.abs(np.linalg.norm(qt[:, :4], axis=1) - 1) <= NORM_TOLERANCE
         poses[unit_length] = pose_from_qt(qt[unit_length])
     sizes = np.cbrt(np.linalg.det(np.nan_to_num(poses[:, :3, :3])))
-    valid = np.isfinite(poses).all(axis=(1, 2)) & (np.abs(sizes - 1) <= NORM_TOLERANCE)
+    valid = (np.abs(poses) < FARTHEST_M).all(axis=(1, 2)) & (np.abs(sizes - 1) <= NORM_TOLERANCE)
     bad = [f"{where}: found {' '.join(words)[:80]!r}" for (where, words), is_pose in zip(rows, valid, strict=True)
            if not is_pose]  # fmt: skip
     if len(bad) > len(rows) / 2:
@@ -235,9 +238,10 @@ def read_track(
     if len(stamps) != len(rows):
         poses[~valid] = np.nan
         return Track(None, poses, kind, note)
-    at = to_us(stamps[valid], unit, path, near_us)
-    order = np.argsort(at, kind="stable")
-    return Track(at[order], poses[valid][order], kind, note)
+    at, order = np.unique(to_us(stamps[valid], unit, path, near_us), return_index=True)
+    if (again := np.count_nonzero(valid) - len(at)) > 0:
+        note += f"{'; ' if note else ''}{again} lines repeat a time, of which the first counts"
+    return Track(at, poses[valid][order], kind, note)
 
 
 def read_fixes(path: Path) -> pd.DataFrame:
@@ -256,8 +260,10 @@ def read_fixes(path: Path) -> pd.DataFrame:
     rows = rows.assign(**{name: rows[name].replace("", value) if name in rows else value
                           for name, value in defaults.items()})  # fmt: skip
     rows[list(FIX)] = numbers_in(rows, FIX, path)
-    for line in rows["line"][(rows["image"] == "") & (rows["timestamp"] == "")]:
-        raise CaptureError(f"{path}, line {line}: expected the columns image or timestamp, {', '.join(FIX)}.")
+    outside = (np.abs(rows[list(FIX)]) > [90, 180, FARTHEST_M, FARTHEST_M]).any(axis=1)
+    for line in rows["line"][outside | ((rows["image"] == "") & (rows["timestamp"] == ""))]:
+        expected = f"expected image or timestamp, and {', '.join(FIX)} in degrees and meters"
+        raise CaptureError(f"{path}, line {line}: {expected}.")
     return rows
 
 
