@@ -65,7 +65,7 @@ def test_a_report_says_what_was_used_left_out_and_assumed(tmp_path: Path) -> Non
     (camera,) = first["cameras"]
     assert (camera["images"], camera["focal_px"], camera["from"]) == (2, [50.5], "given by --camera")
     assert first["unit"] == "m"
-    assert first["unit from"] == "poses in units of 0.5 m"
+    assert first["unit from"] == "--unit 0.5"
     assert "y up, z backward" in first["convention"]
     assert first["up"].startswith("(-0.00, 1.00" if first["up"].startswith("(-") else "(0.00, 1.00")
     assert first["seconds"] > 0

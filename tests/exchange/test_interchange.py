@@ -325,7 +325,7 @@ def test_the_unit_and_the_axes_of_a_model(model: Path, tmp_path: Path) -> None:
     assert "unknown: relative to the depth of the scene" in report.text()
     assert Capture.open(tmp_path / "A").unit is None
     report = import_colmap(model, tmp_path / "photos", tmp_path / "B", device="hl", unit_m=0.5, axes="opengl")
-    assert "m, from poses in units of 0.5 m" in report.text()
+    assert "m, from --unit 0.5" in report.text()
     assert Capture.open(tmp_path / "B").unit == "m"
     given, found = (poses_of(Capture.open(tmp_path / place)["hl_map"]) for place in "AB")
     assert given.keys() == found.keys()

@@ -89,6 +89,7 @@ def import_dataset(
     root, images = layout.read(folder)
     options["unit_m"], options["hold_out"] = 1.0, options.get("hold_out") or HOLD_OUT
     draft = start(capture, device, "map", root, **options)
+    draft.record["meters"] = f"the files of {kind}"
     numbers, taken = Counter[str](), list[Photograph]()
     for image in sorted(images, key=lambda image: image.name):
         number = numbers[parent := str(Path(image.name).parent)]

@@ -65,7 +65,7 @@ from toolkit.files import (
     write_folder,
     write_text,
 )
-from toolkit.geometry import Floats, make_pose
+from toolkit.geometry import Floats, make_pose, scaled
 from toolkit.manifest import nearest
 
 SUBSESSION = "import"
@@ -274,10 +274,10 @@ class Draft(Options):
         scale = 1.0 if self.unit_m is None else self.unit_m
         if self.axes != "opencv" or scale != 1:
             turn = AXES[self.axes]
-            self.poses = {frame: posed_camera(pose, self.axes, scale) for frame, pose in self.poses.items()}
-            self.rigs = [(rig, sensor, posed_camera(turn @ pose, self.axes, scale)) for rig, sensor, pose in self.rigs]
+            self.poses = {frame: scaled(pose @ turn, scale) for frame, pose in self.poses.items()}
+            self.rigs = [(rig, sensor, scaled(turn @ pose @ turn, scale)) for rig, sensor, pose in self.rigs]
         if self.unit_m is not None and not is_aligned:
-            self.record = {"meters": f"poses in units of {self.unit_m:g} m"} | self.record
+            self.record = {"meters": f"--unit {self.unit_m:g}"} | self.record
         self.record["unit"] = "m" if not self.poses or "meters" in self.record else None
         if is_aligned and self.poses:
             self._align()
@@ -542,8 +542,8 @@ class Draft(Options):
             span = f"from {at.min()} to {at.max()} us, the images from {min(times.values())} to {max(times.values())}"
             raise CaptureError(f"{self.odometry}: no image was taken in its time: {span}. Give --timestamps.")
         self.notes += [track.note] if track.note else []
-        poses = [posed_camera(pose, self.axes, self.unit_m or 1.0) for pose in track.poses]
-        return Trajectory.from_poses(at, [self.images[0].device] * len(at), np.stack(poses))
+        poses = scaled(track.poses @ AXES[self.axes], self.unit_m or 1.0)
+        return Trajectory.from_poses(at, [self.images[0].device] * len(at), poses)
 
     def _fix_rows(self, times: Mapping[str, int]) -> list[tuple[Any, ...]]:
         """Return the rows of gps.txt."""
@@ -831,14 +831,3 @@ def _loose(name: str) -> str:
 def _is_mask(name: str) -> bool:
     path = PurePosixPath(name)
     return MASKS in path.parts[:-1] and path.suffix == ".png" and path.stem.lower().endswith(IMAGE_SUFFIXES)
-
-
-def posed_camera(world_from_named: Floats, axes: str, unit_m: float) -> Floats:
-    """Return world_from_cam (4, 4) in meters and with the toolkit's camera axes.
-
-    Args:
-        world_from_named: pose (4, 4) of a camera with the axes `AXES[axes]`.
-        unit_m: length of the pose's unit, meters.
-    """
-    world_from_cam = world_from_named @ AXES[axes]
-    return make_pose(world_from_cam[:3, :3], unit_m * world_from_cam[:3, 3])
