@@ -332,3 +332,18 @@ def test_a_file_without_intrinsics_or_frames_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="cannot be read"):
         import_transforms(tmp_path / "nothing.json", tmp_path / "PLACE")
     assert not (tmp_path / "PLACE").exists()
+
+
+def test_the_world_is_moved_to_known_places(tmp_path: Path) -> None:
+    """Centers of the cameras in meters: the poses of an unknown unit, and their rotations, follow."""
+    count, turn = 8, quaternion_to_rotation([0.9, 0.1, -0.2, 0.3])
+    frames = [{"file_path": f"images/{k}.jpg", "transform_matrix": matrix(k)} for k in range(count)]
+    true = [5.0 * turn @ np.array(matrix(k))[:3, 3] + [100.0, 50.0, 3.0] for k in range(count)]
+    rows = [f"images/{k}.jpg,{','.join(map(repr, xyz.tolist()))}" for k, xyz in enumerate(true)]
+    (tmp_path / "places.csv").write_text("\n".join(["image,x,y,z", *rows]))
+    session = imported(write(tmp_path, frames), tmp_path / "PLACE", positions=tmp_path / "places.csv")
+    found = session.world_from_cam()
+    np.testing.assert_allclose(found[:, :3, 3], true, rtol=0, atol=1e-6)
+    expected = [turn @ (np.array(matrix(k)) @ np.diag([1, -1, -1, 1]))[:3, :3] for k in range(count)]
+    np.testing.assert_allclose(found[:, :3, :3], expected, rtol=0, atol=1e-6)
+    assert json.loads((session.path / "proc" / "import.json").read_text())["unit"] == "m"
