@@ -139,6 +139,16 @@ def test_the_unit_of_times_is_told_by_their_size_or_given(unit: str, scale: floa
     assert read_times(file, listed_names, unit) == {name: k * 100_000 for k, name in enumerate(listed_names)}
 
 
+def test_a_table_has_a_column_of_times(tmp_path: Path) -> None:
+    folder, table = photos(tmp_path / "photos", "0.png", "1.png"), tmp_path / "t.csv"
+    table.write_text("image,timestamp\n0.png,0.25\n1.png,0.75\n")
+    report = import_images(folder, tmp_path / "PLACE", table=table, camera=CAMERA, timestamps_unit="s")
+    assert report.images["timestamp"].tolist() == [250_000, 750_000]
+    assert report.record["timestamps"] == [2, "as given"]
+    with pytest.raises(ManifestError, match=r"t\.csv: found times such as 0.5. Give --timestamps-unit"):
+        import_images(folder, tmp_path / "OTHER", table=table, camera=CAMERA)
+
+
 def test_names_that_end_alike_are_not_confused(tmp_path: Path) -> None:
     file, names = tmp_path / "times.txt", ["cam0/1.png", "cam1/1.png", "cam1/2.png"]
     file.write_text("1 1.png\n2 2.png\n3 cam0/1.png\n")

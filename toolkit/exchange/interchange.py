@@ -1,9 +1,10 @@
 """Import COLMAP models and folders of images as sessions of a capture (see `drafts`).
 
 A folder of images may have a table, a CSV file with a header. Column `image` is the path in the folder; `qw qx qy qz tx
-ty tz` are the pose; `camera_id` names a camera in a COLMAP `cameras.txt`, or `model width height params` (params
-separated by spaces) give the camera directly. The order of columns is free; unknown columns are an error. A query list
-of hloc, `name MODEL width height parameters` per line, is accepted in place of the table.
+ty tz` are the pose; `timestamp` is the time; `camera_id` names a camera in a COLMAP `cameras.txt`, or `model width
+height params` (params separated by spaces) give the camera directly. The order of columns is free; unknown columns are
+an error. A query list of hloc, `name MODEL width height parameters` per line, is accepted in place of the table; and
+lists of poses without names, see `recordings.read_track`.
 """
 
 from collections import Counter
@@ -48,6 +49,7 @@ from toolkit.exchange.recordings import (
     read_text,
     read_times,
     read_track,
+    to_us,
 )
 from toolkit.exchange.transforms import import_transforms
 from toolkit.files import file_fingerprint, files_fingerprint, read_json
@@ -182,6 +184,8 @@ def import_images(
     if bad_poses and truth is not None:
         first = next(iter(bad_poses.items()))
         draft.notes.append(f"{len(bad_poses)} images have no usable ground truth; first: {first[0]}: {first[1]}")
+    stamps = to_us(rows["timestamp"], draft.timestamps_unit, table).tolist() if "timestamp" in rows else []
+    times = dict(zip(rows["image"], stamps, strict=False))
     for row in rows.to_dict("records"):
         name, where = str(row["image"]), f"{table}, line {row['line']}"
         try:
@@ -191,7 +195,7 @@ def import_images(
             image_camera, origin = _camera_of(row, listed_cameras, shared_camera, folder / name, where)
         except (ImageError, CaptureError) as error:
             image_camera, origin = str(error), ""
-        draft.add_image(name, image_camera, poses.get(name), origin)
+        draft.add_image(name, image_camera, poses.get(name), origin, times.get(name))
     if truth is not None:
         draft.notes.append(f"ground truth of {len(draft.poses)} of {len(rows)} images: {truth}")
     return draft.finish()
@@ -414,7 +418,7 @@ def _read_table(path: Path) -> pd.DataFrame:
     first = next((line for line in text.splitlines() if line.strip()), "").split()
     of_hloc = len(first) > 4 and first[1] in pycolmap.CameraModelId.__members__
     rows = _read_hloc_list(text) if of_hloc else read_csv(path)
-    columns = ("image", *POSE_NAMES, "camera_id", *_CAMERA_COLUMNS)
+    columns = ("image", *POSE_NAMES, "timestamp", "camera_id", *_CAMERA_COLUMNS)
     for name, count in Counter(rows.columns[:-1]).items():
         if name not in columns:
             raise CaptureError(f"{path}: unknown column {name!r}. {nearest(name, columns)}")
