@@ -179,8 +179,9 @@ def import_images(
     shared_camera = None if camera is None else camera_at("camera", camera)
     posed = rows if truth is None else _read_truth(Path(truth), rows, draft, tracks[1])
     poses = _poses_of(posed, poses_are)
+    bad = posed[posed["problem"] != ""] if "problem" in posed else posed[:0]
     bad_poses = {str(row["image"]): (f"line {row['line']}: " if row["line"] else "") + row["problem"]
-                 for row in _bad(posed).to_dict("records")}  # fmt: skip
+                 for row in bad.to_dict("records")}  # fmt: skip
     if bad_poses and truth is not None:
         first = next(iter(bad_poses.items()))
         draft.notes.append(f"{len(bad_poses)} images have no usable ground truth; first: {first[0]}: {first[1]}")
@@ -191,7 +192,6 @@ def import_images(
         try:
             if truth is None and name in bad_poses:
                 raise CaptureError(f"{table}, {bad_poses[name]}")
-            image_camera: pycolmap.Camera | str
             image_camera, origin = _camera_of(row, listed_cameras, shared_camera, folder / name, where)
         except (ImageError, CaptureError) as error:
             image_camera, origin = str(error), ""
@@ -326,10 +326,10 @@ def camera_at(where: object, params: str) -> pycolmap.Camera:
 def _camera_of(
     row: Mapping[Any, Any], by_id: Mapping[str, pycolmap.Camera | str], shared: pycolmap.Camera | None, path: Path,
     where: str,
-) -> tuple[pycolmap.Camera, str]:
+) -> tuple[pycolmap.Camera | str, str]:
     """Return the camera of an image and its origin: the table, cameras.txt, the camera shared by all images, or EXIF.
 
-    `where` names file and line of the image's row, for messages.
+    The camera may be why it cannot be used. `where` names file and line of the image's row, for messages.
     """
     if "model" in row:
         text = ", ".join([row["model"], row["width"], row["height"], *str(row["params"]).split()])
@@ -338,18 +338,12 @@ def _camera_of(
         if row["camera_id"] not in by_id:
             ids = ", ".join(by_id) or "none: give cameras.txt"
             raise CaptureError(f"{where}: camera_id {row['camera_id']!r} is not in cameras.txt (it has: {ids}).")
-        return _usable(by_id[row["camera_id"]]), "given by cameras.txt"
+        return by_id[row["camera_id"]], "given by cameras.txt"
     if len(by_id) > 1:
         raise CaptureError(f"cameras.txt has {len(by_id)} cameras; give a table with the columns image, camera_id.")
     if by_id:
-        return _usable(next(iter(by_id.values()))), "given by cameras.txt"
+        return next(iter(by_id.values())), "given by cameras.txt"
     return (shared, "given by --camera") if shared is not None else exif_camera(path)
-
-
-def _usable(camera: pycolmap.Camera | str) -> pycolmap.Camera:
-    if isinstance(camera, str):
-        raise CaptureError(camera)
-    return camera
 
 
 def _has_cameras(table: str | Path | None, cameras: str | Path | None) -> bool:
@@ -392,11 +386,6 @@ def _poses_of(rows: pd.DataFrame, poses_are: str) -> dict[str, Floats]:
     elif poses_are == "rotation_of_cam_from_world":
         poses = make_pose(np.swapaxes(poses[:, :3, :3], 1, 2), poses[:, :3, 3])
     return dict(zip(map(str, rows["image"]), poses, strict=True))
-
-
-def _bad(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of a table whose poses are not valid."""
-    return rows[rows["problem"] != ""] if "qw" in rows else rows[:0]
 
 
 def read_poses(table: Path, poses_are: str) -> tuple[list[str], dict[str, Floats]]:
