@@ -18,7 +18,7 @@ help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1|/' | column -t -s '|'
 
 demo: $(INSTALLED)  ## render a small capture, localize all nine pairs, write a report
-	$(BIN)/python -m toolkit run data_manifests/demo.yaml
+	$(BIN)/python -m toolkit run demo
 
 run: $(INSTALLED)  ## run RUN_MANIFEST=data_manifests/<yours>.yaml
 	$(BIN)/python -m toolkit run $(RUN_MANIFEST)
@@ -71,14 +71,9 @@ docs-images: $(INSTALLED)  ## draw the documentation's pictures from a demo run;
 docs-view: $(INSTALLED)  ## draw the documentation's picture of the localization view; needs mesa-vulkan-drivers
 	$(BIN)/python -m docs.view_image
 
-# Your changes to a copy stay: a newer notebook replaces it only if you have not changed it. The page shows the whole
-# project, so that links from a notebook to a run's report and recordings work.
+# Your changes to a copy stay: a newer notebook replaces it only if you have not changed it.
 lab: $(INSTALLED)  ## open JupyterLab on your own copies of the notebooks, in lab/; LAB_ARGS="--port 9999" or others
-	@mkdir -p lab/.from; for new in notebooks/*.ipynb; do name=$${new##*/}; \
-	if [ ! -e lab/$$name ] || cmp -s lab/$$name lab/.from/$$name; then cp $$new lab/$$name; cp $$new lab/.from/$$name; \
-	elif ! cmp -s $$new lab/.from/$$name; then \
-	  echo "$$new is newer than lab/$$name, which you have changed: delete yours to take it."; fi; done
-	$(BIN)/python -m jupyterlab --config=notebooks/lab_config.py --notebook-dir . $(LAB_ARGS) lab/start.ipynb
+	$(BIN)/python -m toolkit lab $(LAB_ARGS)
 
 lint: $(INSTALLED)  ## run ruff and mypy
 	$(BIN)/python -m ruff check .

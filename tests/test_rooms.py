@@ -1,7 +1,6 @@
 """Imports point down: what stands on what in `toolkit/`. CONTRIBUTING draws the same picture."""
 
 import ast
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -96,12 +95,3 @@ def test_no_module_imports_itself_through_others() -> None:
 def test_the_top_level_is_a_table_of_contents() -> None:
     files = {path.stem for path in TOOLKIT.glob("*.py")} - {"__init__"}
     assert files == {"__main__", "pipeline", "notebook", *STAGES, "geometry", "files", "threads", "errors"}
-
-
-def test_a_wheel_has_every_file_that_is_no_module() -> None:
-    root = TOOLKIT.parent
-    patterns = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
-    listed = {path for package, names in patterns.items() for name in names
-              for path in root.joinpath(*package.split(".")).glob(name)}  # fmt: skip
-    files = {path for path in TOOLKIT.rglob("*") if path.is_file() and "__pycache__" not in path.parts}
-    assert {path for path in files if path.suffix != ".py"} == listed
