@@ -63,7 +63,7 @@ docs-setup: $(INSTALLED)  ## install the tools that build the documentation (pip
 docs: $(INSTALLED)  ## build the documentation: build/docs/index.html
 	@$(BIN)/python -c 'import latex2mathml, material, mkdocstrings' 2> /dev/null || $(MAKE) --no-print-directory docs-setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
-	@echo "Documentation: build/docs/index.html (for its search: $(BIN)/python -m http.server --directory build/docs)"
+	@echo "Documentation: build/docs/index.html"
 
 docs-images: $(INSTALLED)  ## draw the documentation's pictures from a demo run; first: make browser-setup
 	$(BIN)/python -m docs.make_images

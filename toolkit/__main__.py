@@ -79,7 +79,7 @@ Settings = Annotated[
 Capture = Annotated[Path | None, Option(help="Capture folder, if it has moved since the run.")]
 Json = Annotated[bool, Option("--json", help="Print only a summary as JSON to stdout, everything else to stderr.")]
 _CLUSTER = "Dask workers: N on this machine, of a scheduler, or started by a cluster's queue (see docs/scaling.md)."
-_KINDS = "7scenes, 12scenes, cambridge, aachen, eth3d, tum, kitti or euroc."
+_KINDS = "7scenes, 12scenes, cambridge, aachen, eth3d, tum, kitti, euroc; strecha or strecha-hard: three devices."
 _ONLY = "Run only these stages; `map`: build the maps without queries, for `localize`."
 _MANIFEST = "Manifest: a file, or the name of one in data_manifests/ or of the toolkit's own, such as demo."
 _SWEEP = "Run once per value, each in its own folder, and compare. Repeat it to run all combinations."
@@ -483,11 +483,17 @@ def import_dataset(
     """Make a map and queries from a data set of the field, and a manifest with its thresholds."""
     from toolkit.exchange.datasets import LAYOUTS, import_dataset
     from toolkit.exchange.new_manifest import new_manifest
+    from toolkit.synthetic.photographs import KINDS, SCENES, THRESHOLDS, arrange
 
-    for report in import_dataset(kind, path, capture, scene, device, every, hold_out, placing):
-        print(report.text())
+    if kind in KINDS:
+        arrange(path, capture, (scene,) if scene else SCENES, hard=KINDS[kind])
+        thresholds = THRESHOLDS
+    else:
+        for report in import_dataset(kind, path, capture, scene, device, every, hold_out, placing):
+            print(report.text())
+        thresholds = LAYOUTS[kind].thresholds
     name = re.sub(r"[^A-Za-z0-9._-]", "-", capture.resolve().name)
-    print(f"Run it: python -m toolkit run {new_manifest(name, capture, thresholds=LAYOUTS[kind].thresholds)}")
+    print(f"Run it: python -m toolkit run {new_manifest(name, capture, thresholds=thresholds)}")
 
 
 @app.command()
