@@ -1,6 +1,8 @@
 """Imports point down: what stands on what in `toolkit/`. CONTRIBUTING draws the same picture."""
 
 import ast
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -95,3 +97,16 @@ def test_no_module_imports_itself_through_others() -> None:
 def test_the_top_level_is_a_table_of_contents() -> None:
     files = {path.stem for path in TOOLKIT.glob("*.py")} - {"__init__"}
     assert files == {"__main__", "pipeline", "notebook", *STAGES, "geometry", "files", "threads", "errors"}
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+def test_each_test_is_of_one_kind() -> None:
+    """Of `make test-numbers`, `-faults` and `-notebooks`; those for a browser or a GPU have targets of their own."""
+    ask = ["make", "-n", "test-numbers", "test-faults", "test-notebooks"]
+    said = subprocess.run(ask, cwd=TOOLKIT.parent, capture_output=True, text=True, check=True).stdout
+    named = [word.removeprefix("tests/") for word in said.split() if word.startswith("tests/")]
+    places = {
+        path.name for path in (TOOLKIT.parent / "tests").iterdir()
+        if path.name.startswith("test_") or (path.is_dir() and any(path.glob("test_*.py")))
+    }  # fmt: skip
+    assert sorted(named) == sorted(places - {"browser", "gpu"})
