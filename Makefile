@@ -10,15 +10,23 @@ BIN := $(VENV)/bin
 # A worker needs up to 2 GB (slow tests: 6). Tests of a module stay in one worker because they share slow fixtures.
 PYTEST := $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadscope
 
+NUMBERS := $(addprefix tests/,alignment embedders features mapping models pose prediction scene sequences synthetic \
+	$(addsuffix .py,$(addprefix test_,accuracy benchmark_reader confidence embed evaluate geometry localize \
+	references_file rerank retrieve sequence threads)))
+FAULTS := $(addprefix tests/,capture exchange fuzz store $(addsuffix .py,$(addprefix test_,damage empty_sets files kills \
+	lineage manifest pretend_device properties stops)))
+NOTEBOOKS := $(addprefix tests/,figures report results runs viewer $(addsuffix .py,$(addprefix test_,compare_notebook \
+	docs lab notebooks own_images package pipeline rooms visualize)))
+
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo run test test-kernels test-slow test-browser test-rest browser-setup docs docs-setup docs-images docs-view lab lint bench clean test-gpu bench-gpu
+.PHONY: help demo run test test-kernels test-numbers test-faults test-notebooks test-slow test-browser test-rest browser-setup docs docs-setup docs-images docs-view lab lint bench clean test-gpu bench-gpu
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1|/' | column -t -s '|'
 
 demo: $(INSTALLED)  ## render a small capture, localize all nine pairs, write a report
-	$(BIN)/python -m toolkit run data_manifests/demo.yaml
+	$(BIN)/python -m toolkit run demo
 
 run: $(INSTALLED)  ## run RUN_MANIFEST=data_manifests/<yours>.yaml
 	$(BIN)/python -m toolkit run $(RUN_MANIFEST)
@@ -31,6 +39,16 @@ test-kernels: $(INSTALLED)  ## run the tests of numbers with other BLAS kernels 
 	@set -e; for run in "Haswell 1" "Prescott 2"; do echo "$$run BLAS threads"; \
 	OPENBLAS_CORETYPE=$${run% *} OPENBLAS_NUM_THREADS=$${run#* } $(PYTEST) tests/test_threads.py tests/test_localize.py \
 	tests/test_geometry.py tests/features tests/embedders tests/alignment tests/mapping tests/pose tests/prediction tests/scene tests/sequences; done
+
+# All tests of a kind, default and slow. Together the three have every test that needs neither a browser nor a GPU.
+test-numbers: $(INSTALLED)  ## test what is computed: features, maps, poses, networks, errors, accuracy on captures
+	$(PYTEST) -m "slow or not slow and not browser and not gpu" $(NUMBERS)
+
+test-faults: $(INSTALLED)  ## test wrong input, damaged files, kills, full disks, imports and exports
+	$(PYTEST) -m "slow or not slow and not browser and not gpu" $(FAULTS)
+
+test-notebooks: $(INSTALLED)  ## test notebooks, runs, figures, reports, recordings, the package and its pages
+	$(PYTEST) -m "slow or not slow and not browser and not gpu" $(NOTEBOOKS)
 
 test-slow: $(INSTALLED)  ## run the slow tests: whole runs, and accuracy on real captures if present
 	$(PYTEST) -m slow
@@ -63,7 +81,7 @@ docs-setup: $(INSTALLED)  ## install the tools that build the documentation (pip
 docs: $(INSTALLED)  ## build the documentation: build/docs/index.html
 	@$(BIN)/python -c 'import latex2mathml, material, mkdocstrings' 2> /dev/null || $(MAKE) --no-print-directory docs-setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
-	@echo "Documentation: build/docs/index.html (for its search: $(BIN)/python -m http.server --directory build/docs)"
+	@echo "Documentation: build/docs/index.html"
 
 docs-images: $(INSTALLED)  ## draw the documentation's pictures from a demo run; first: make browser-setup
 	$(BIN)/python -m docs.make_images
@@ -71,14 +89,9 @@ docs-images: $(INSTALLED)  ## draw the documentation's pictures from a demo run;
 docs-view: $(INSTALLED)  ## draw the documentation's picture of the localization view; needs mesa-vulkan-drivers
 	$(BIN)/python -m docs.view_image
 
-# Your changes to a copy stay: a newer notebook replaces it only if you have not changed it. The page shows the whole
-# project, so that links from a notebook to a run's report and recordings work.
+# Your changes to a copy stay: a newer notebook replaces it only if you have not changed it.
 lab: $(INSTALLED)  ## open JupyterLab on your own copies of the notebooks, in lab/; LAB_ARGS="--port 9999" or others
-	@mkdir -p lab/.from; for new in notebooks/*.ipynb; do name=$${new##*/}; \
-	if [ ! -e lab/$$name ] || cmp -s lab/$$name lab/.from/$$name; then cp $$new lab/$$name; cp $$new lab/.from/$$name; \
-	elif ! cmp -s $$new lab/.from/$$name; then \
-	  echo "$$new is newer than lab/$$name, which you have changed: delete yours to take it."; fi; done
-	$(BIN)/python -m jupyterlab --config=notebooks/lab_config.py --notebook-dir . $(LAB_ARGS) lab/start.ipynb
+	$(BIN)/python -m toolkit lab $(LAB_ARGS)
 
 lint: $(INSTALLED)  ## run ruff and mypy
 	$(BIN)/python -m ruff check .

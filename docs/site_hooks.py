@@ -29,6 +29,8 @@ ELSEWHERE = {
     "changelog.md": "CHANGELOG.md",
 }
 """Pages of the site whose files are not in docs/: where the site has them, where the repository."""
+DRAWER = {"76.25em": "68.75em", "76.234375em": "68.734375em"}
+"""The width below which the theme folds its navigation away, 1,220 px, and what it becomes, 1,100 px."""
 SETTINGS = "<!-- all settings -->"
 """What the tables of all settings take the place of."""
 END = "...\n"  # of a YAML document that is a plain value
@@ -67,14 +69,20 @@ def on_page_markdown(markdown: str, page: "Page", **_: Any) -> str:
 
 
 def on_post_build(config: "MkDocsConfig") -> None:
-    """Refuse a site that needs other machines.
+    """Show the navigation on screens of 1,200 px, and refuse a site that needs other machines.
 
     Raises:
-        PluginError: names the pages and what they would fetch.
+        PluginError: names the pages and what they would fetch; or the theme has no such width.
     """
     from mkdocs.exceptions import PluginError
 
     site = Path(config.site_dir)
+    styles = [*site.glob("assets/stylesheets/main.*.css"), *site.glob("assets/stylesheets/palette.*.css")]
+    for file in [*styles, *site.glob("assets/javascripts/bundle.*.js")]:
+        text = file.read_text()
+        if "76.25em" not in text:
+            raise PluginError(f"{file.name} of the theme knows no width of 76.25em: mend DRAWER in docs/site_hooks.py.")
+        file.write_text(re.sub("|".join(map(re.escape, DRAWER)), lambda found: DRAWER[found[0]], text))
     asked = [
         f"{file.relative_to(site)}: {address}"
         for file in sorted(site.rglob("*"))

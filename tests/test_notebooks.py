@@ -19,7 +19,7 @@ import pytest
 from toolkit import notebook, pipeline
 from toolkit.errors import ArtifactError, ManifestError, StageError
 from toolkit.manifest import OPTIONAL, STAGES, Manifest, RetrieveSettings
-from toolkit.notebook import notebook_parameters, notebook_path
+from toolkit.notebook import StatusLine, notebook_parameters, notebook_path
 from toolkit.runs.folder import LOG_VARIABLE
 
 # What the pipeline sets for a run, so that a manifest has it once and not in a section.
@@ -314,3 +314,18 @@ def test_a_notebook_starts_without_nbformat() -> None:
     )
     root = notebook_path("localize").parents[1]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
+
+
+def test_a_log_is_told_the_share_that_is_done_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(notebook.time, "monotonic", lambda: now[0])
+    said: list[str] = []
+    line = StatusLine("[4/6] localize demo", lambda text, **_: said.append(text))
+    for seconds, done in ((1, 2), (29, 10), (31, 20), (40, 30), (62, 50)):
+        now[0] = seconds
+        line.write(f"\rlocalize:  {done}%|##   | {done}/100 [00:0{done}<01:00]")
+    line.write("a warning of the kernel\n")
+    line.end("100 queries")
+    assert said[0] == "[4/6] localize demo ..."
+    assert [text.split()[:3] for text in said[1:-1]] == [["localize:", "20%", "20/100"], ["localize:", "50%", "50/100"]]
+    assert said[-1].strip() == "100 queries"

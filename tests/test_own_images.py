@@ -174,7 +174,10 @@ def test_it_runs_again_and_stops_where_the_input_is_another(small_capture: Path,
     for _ in range(2):
         execute(PATH, tmp_path / "out.ipynb", folders)
         page = (tmp_path / "out.ipynb").read_text()
-        assert "there and back: 6 images" in page
+        moved = re.search(r"there and back: 6 images, at most (\S+) m and (\S+) degrees", page)
+        assert moved is not None
+        assert float(moved[1]) < 1e-9
+        assert float(moved[2]) < 1e-9
         assert "OWN_map_ios_query_ios.txt" in page
     assert "imported before from the same input, kept" in page
     table = str(next((tmp_path / "OWN").rglob("map.csv")))

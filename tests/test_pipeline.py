@@ -154,6 +154,7 @@ def test_a_stage_runs_again_only_when_something_has_changed(
     assert go("retrieve.topk=3") == {"embed": reused, "retrieve": done}
     (place / "P/sessions/ios_map/images.txt").write_text("# changed\n")
     assert go("retrieve.topk=3", only="embed")["embed"] == done
+    assert go("retrieve.topk=2", only="retrieve, embed") == {"embed": reused, "retrieve": done}
 
 
 def test_no_kernel_is_started_for_what_is_reused(

@@ -1,7 +1,8 @@
 """Imports point down: what stands on what in `toolkit/`. CONTRIBUTING draws the same picture."""
 
 import ast
-import tomllib
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -98,10 +99,14 @@ def test_the_top_level_is_a_table_of_contents() -> None:
     assert files == {"__main__", "pipeline", "notebook", *STAGES, "geometry", "files", "threads", "errors"}
 
 
-def test_a_wheel_has_every_file_that_is_no_module() -> None:
-    root = TOOLKIT.parent
-    patterns = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
-    listed = {path for package, names in patterns.items() for name in names
-              for path in root.joinpath(*package.split(".")).glob(name)}  # fmt: skip
-    files = {path for path in TOOLKIT.rglob("*") if path.is_file() and "__pycache__" not in path.parts}
-    assert {path for path in files if path.suffix != ".py"} == listed
+@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+def test_each_test_is_of_one_kind() -> None:
+    """Of `make test-numbers`, `-faults` and `-notebooks`; those for a browser or a GPU have targets of their own."""
+    ask = ["make", "-n", "test-numbers", "test-faults", "test-notebooks"]
+    said = subprocess.run(ask, cwd=TOOLKIT.parent, capture_output=True, text=True, check=True).stdout
+    named = [word.removeprefix("tests/") for word in said.split() if word.startswith("tests/")]
+    places = {
+        path.name for path in (TOOLKIT.parent / "tests").iterdir()
+        if path.name.startswith("test_") or (path.is_dir() and any(path.glob("test_*.py")))
+    }  # fmt: skip
+    assert sorted(named) == sorted(places - {"browser", "gpu"})

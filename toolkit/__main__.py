@@ -1,4 +1,4 @@
-"""The command line: `python -m toolkit run|compare|settings|check|new|import|export|...`; `--help` lists them."""
+"""The command line: `visloc run|lab|compare|settings|check|new|import|export|...`, or `python -m toolkit ...`."""
 
 import inspect
 import json
@@ -19,7 +19,16 @@ try:
     import typer
     from typer import Argument, Option
 
-    from toolkit.errors import ArtifactError, IncompleteError, ManifestError, ToolkitError, exit_code, sentence
+    from toolkit import __version__
+    from toolkit.errors import (
+        ArtifactError,
+        IncompleteError,
+        ManifestError,
+        ToolkitError,
+        exit_code,
+        optional,
+        sentence,
+    )
 except ModuleNotFoundError as missing:  # users may run `python -m toolkit` with the wrong Python
     raise SystemExit(
         f"Error: {sys.executable} has no package {missing.name}. Use the Python that the toolkit is installed for: "
@@ -27,10 +36,9 @@ except ModuleNotFoundError as missing:  # users may run `python -m toolkit` with
     ) from None
 
 app = typer.Typer(
-    help="Visual localization: find where images were taken in a map of images with known poses.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 
@@ -80,8 +88,9 @@ Settings = Annotated[
 Capture = Annotated[Path | None, Option(help="Capture folder, if it has moved since the run.")]
 Json = Annotated[bool, Option("--json", help="Print only a summary as JSON to stdout, everything else to stderr.")]
 _CLUSTER = "Dask workers: N on this machine, of a scheduler, or started by a cluster's queue (see docs/scaling.md)."
-_KINDS = "7scenes, 12scenes, cambridge, aachen, eth3d, tum, kitti or euroc."
-_ONLY = "Run only this stage; `map`: build the maps without queries, for `localize`."
+_KINDS = "7scenes, 12scenes, cambridge, aachen, eth3d, tum, kitti, euroc; strecha or strecha-hard: three devices."
+_ONLY = "Run only these stages; `map`: build the maps without queries, for `localize`."
+_MANIFEST = "Manifest: a file, or the name of one in data_manifests/ or of the toolkit's own, such as demo."
 _SWEEP = "Run once per value, each in its own folder, and compare. Repeat it to run all combinations."
 _FAILED = (
     "What to write for a query without a pose. `nearest`, the default: the pose of its best retrieved reference, as "
@@ -95,10 +104,23 @@ _DISTANCE = "Meters between two points, given by a pixel each, or between the ca
 _TABLE = "CSV with a header: image; qw,qx,qy,qz,tx,ty,tz for poses; camera_id, or model,width,height,params."
 
 
+def _version(asked: bool) -> None:
+    if asked:
+        print(f"visual-localization {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[bool, Option("--version", callback=_version, is_eager=True, help="Show the version.")] = False,
+) -> None:
+    """Visual localization: find where images were taken in a map of images with known poses."""
+
+
 @app.command()
 def run(
-    manifest: Annotated[Path, Argument(help="Manifest, for example data_manifests/demo.yaml.")],
-    only: Annotated[str | None, Option(metavar="STAGE", help=_ONLY)] = None,
+    manifest: Annotated[str, Argument(help=_MANIFEST)],
+    only: Annotated[str | None, Option(metavar="STAGE,...", help=_ONLY)] = None,
     force: Annotated[bool, Option("--force", help="Also run stages that are up to date.")] = False,
     overrides: Settings = None,
     name: Annotated[str | None, Option(help="Name of the run folder; default: says what --set changes.")] = None,
@@ -113,23 +135,26 @@ def run(
     failed than the manifest tolerates (`tolerate_failed`); 3 a bug; 130 or 143 interrupted.
     """
     from toolkit import pipeline
+    from toolkit.manifest import find_manifest
     from toolkit.runs.folder import summary
 
     tell = partial(print, file=sys.stderr) if as_json else print
+    path = Path(manifest)
     try:
+        path = find_manifest(manifest)
         if sweeps and (name or in_place):
             raise ManifestError("--sweep names its runs itself: leave out --name and --in-place.")
         if sweeps:
             _compare_swept(
-                *pipeline.sweep(manifest, sweeps, overrides or (), tell, only, force, cluster), tell, as_json
+                *pipeline.sweep(path, sweeps, overrides or (), tell, only, force, cluster), tell, as_json
             )
             return
-        run_dir = pipeline.run(manifest, only, force, overrides or (), tell, cluster, name, in_place)
+        run_dir = pipeline.run(path, only, force, overrides or (), tell, cluster, name, in_place)
     except BaseException as error:
         if as_json:
             status = {IncompleteError: "incomplete", KeyboardInterrupt: "interrupted"}.get(type(error), "failed")
             outcome = {"status": status, "exit_code": exit_code(error), "error": sentence(error)}
-            _print_json(_summary_of_stopped(manifest, overrides or (), name, in_place) | outcome)
+            _print_json(_summary_of_stopped(path, overrides or (), name, in_place) | outcome)
         raise
     tell(f"Report: {run_dir / 'report.html'}")
     if only == pipeline.MAP:
@@ -218,16 +243,33 @@ def compare(
 
 
 @app.command()
-def settings(stage: Annotated[str, Argument(help="Only this stage, e.g. localize.")] = "") -> None:
+def settings(branch: Annotated[str, Argument(help="Only these, e.g. localize or localize.pnp.")] = "") -> None:
     """Show all settings of a manifest with their meanings and defaults, as YAML to copy into a manifest."""
-    from toolkit.manifest import STAGES, Manifest, describe, nearest
+    from toolkit.manifest import Manifest, describe, nearest
+    from toolkit.manifest.messages import nested_model
 
-    if stage and stage not in STAGES:
-        raise ManifestError(f"settings {stage}: no such stage. {nearest(stage, STAGES)}")
-    if stage:
-        print("\n".join([f"{stage}:", *describe(type(Manifest.defaults(stage)), "  ")]))
-    else:
-        print("\n".join(describe(Manifest)))
+    model: Any = Manifest
+    keys = branch.split(".") if branch else []
+    for key in keys:
+        inner = {name: of for name, field in model.model_fields.items() if (of := nested_model(field.annotation))}
+        if key not in inner:
+            raise ManifestError(f"settings {branch}: no section {key!r}. {nearest(key, inner)}")
+        model = inner[key]
+    heads = [f"{'  ' * depth}{key}:" for depth, key in enumerate(keys)]
+    print("\n".join([*heads, *describe(model, "  " * len(keys))]))
+
+
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def lab(context: typer.Context) -> None:
+    """Open JupyterLab on your own copies of the notebooks, in lab/; further options go to JupyterLab."""
+    from toolkit.notebook import copy_notebooks, shipped
+
+    optional("jupyterlab")
+    for message in copy_notebooks(Path("lab")):
+        print(message)
+    # The page shows the whole folder, so that links from a notebook to a run's report and recordings work.
+    options = [f"--config={shipped('notebooks') / 'lab_config.py'}", "--notebook-dir", ".", *context.args]
+    os.execv(sys.executable, [sys.executable, "-m", "jupyterlab", *options, "lab/start.ipynb"])
 
 
 @app.command()
@@ -294,16 +336,17 @@ def submit(
 
 @app.command()
 def download(
-    manifest: Annotated[Path, Argument(help="Manifest with `dataset`, as data_manifests/crocodl-hydro.yaml.")],
+    manifest: Annotated[str, Argument(help="Manifest with `dataset`: a file, or a name such as crocodl-hydro.")],
     sessions: Annotated[str, Option(metavar="NAME,...", help="Only these, e.g. ios_map,hl_query.")] = "",
     dry_run: Annotated[bool, Option("--dry-run", help="List files and sizes; fetch nothing.")] = False,
     overrides: Settings = None,
 ) -> None:
     """Download, unpack and check the captures of a manifest; resume a stopped download."""
     from toolkit.exchange.download import download
+    from toolkit.manifest import find_manifest
 
     names = [name.strip() for name in sessions.split(",") if name.strip()]
-    reports = download(manifest, names, dry_run, overrides or ())
+    reports = download(find_manifest(manifest), names, dry_run, overrides or ())
     if not all(report.ok for report in reports):
         raise typer.Exit(1)
 
@@ -341,7 +384,8 @@ def importer(name: str) -> Callable[[Callable[..., Any]], None]:
         @wraps(command)
         def run_it(as_json: bool, **given: Any) -> None:
             report = command(**given)
-            print(report.as_json() if as_json else report.text())
+            if report is not None:
+                print(report.as_json() if as_json else report.text())
 
         run_it.__signature__ = own.replace(parameters=list(parameters.values()), return_annotation=None)  # type: ignore
         run_it.__annotations__ = {key: one.annotation for key, one in parameters.items()}
@@ -468,11 +512,16 @@ def import_dataset(
     """Make a map and queries from a data set of the field, and a manifest with its thresholds."""
     from toolkit.exchange.datasets import LAYOUTS, import_dataset
     from toolkit.exchange.new_manifest import new_manifest
+    from toolkit.synthetic.photographs import KINDS, SCENES, THRESHOLDS, arrange
 
-    manifest = _manifest_of(capture)
-    report = import_dataset(kind, path, capture, scene, every=every, hold_out=hold_out, **options)
+    manifest, report, thresholds = _manifest_of(capture), None, THRESHOLDS
+    if kind in KINDS:
+        arrange(path, capture, (scene,) if scene else SCENES, hard=KINDS[kind])
+    else:
+        report = import_dataset(kind, path, capture, scene, every=every, hold_out=hold_out, **options)
+        thresholds = LAYOUTS[kind].thresholds
     if not manifest.exists():
-        new_manifest(manifest.stem, capture, thresholds=LAYOUTS[kind].thresholds)
+        new_manifest(manifest.stem, capture, thresholds=thresholds)
     print(f"Run it: python -m toolkit run {manifest}", file=sys.stderr)
     return report
 
@@ -760,6 +809,9 @@ def main() -> None:
 
     import pycolmap  # noqa: F401 - its import installs a SIGTERM handler, which must not replace the one below
 
+    if not sys.stderr.isatty():
+        os.environ.setdefault("TQDM_MININTERVAL", "30")  # seconds between lines about progress in a log
+
     received: list[int] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -770,7 +822,7 @@ def main() -> None:
         if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) == signal.SIG_DFL:
             signal.signal(getattr(signal, name), stop)
     try:
-        app(prog_name="python -m toolkit")
+        app(prog_name="visloc" if Path(sys.argv[0]).stem == "visloc" else "python -m toolkit")
     except SystemExit as end:  # typer has printed the message
         if end.code != INTERRUPTED:
             raise SystemExit(1 if end.code == USAGE else end.code) from None

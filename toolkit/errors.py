@@ -6,6 +6,9 @@ import os
 import re
 import signal
 import traceback
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, requires
+from importlib.util import find_spec
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, Self
@@ -164,10 +167,54 @@ def shortage(kind: str, text: str) -> str | None:
     return f"{path} cannot be read or written ({reason}). Fix that, or choose another folder, e.g. output_root."
 
 
+EXTRAS = {
+    "notebook": ("papermill", "nbformat", "nbconvert", "jupyter_client", "jupyter_core", "jupyterlab", "IPython"),
+    "viewer": ("rerun", "rerun_notebook"),
+    "cluster": ("distributed", "dask_jobqueue"),
+    "sequence": ("gtsam",),
+    "learned": ("transformers",),
+}
+"""Packages that only a part of the toolkit needs, by the extra of `pyproject.toml` that brings them."""
+
+
+def optional(package: str) -> Any:
+    """Import and return a package of an extra.
+
+    Raises:
+        ManifestError: it is not installed; says how to install it.
+    """
+    try:
+        return import_module(package)
+    except ImportError as error:
+        raise ManifestError(_not_installed(package, error)) from None
+
+
+def require_packages(*packages: str) -> None:
+    """Raise ManifestError if a package of an extra is not installed; none of them is imported."""
+    for package in packages:
+        if find_spec(package) is None:
+            raise ManifestError(_not_installed(package, ImportError("not installed")))
+
+
+def _not_installed(package: str, error: ImportError) -> str:
+    extra = next(extra for extra, packages in EXTRAS.items() if package in packages)
+    try:
+        every = [text.replace('"', "'").partition(";") for text in requires("visual-localization") or ()]
+        needed = [text.strip() for text, _, of in every if f"extra == '{extra}'" in of]
+    except PackageNotFoundError:  # run from a folder, without having been installed
+        needed = [package]
+    install = " ".join(f"'{one}'" for one in needed if not one.startswith("visual-localization"))
+    return f"The package {package} cannot be imported ({error}). To install the extra `{extra}`: pip install {install}"
+
+
 def sentence(error: BaseException) -> str:
     """Return the message about an error for the user."""
     if isinstance(error, ToolkitError):
         return str(error)
+    if isinstance(error, ModuleNotFoundError):
+        package = (error.name or "").partition(".")[0]
+        if any(package in packages for packages in EXTRAS.values()):
+            return _not_installed(package, error)
     if isinstance(error, KeyboardInterrupt):
         return "Interrupted. The same command goes on from here."
     if text := shortage(type(error).__name__, str(error)):

@@ -437,6 +437,23 @@ def _jsonable(value: Any) -> Any:
     raise TypeError(f"Settings must be JSON values: {value!r} is a {type(value).__name__}.")
 
 
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def shipped(folder: str) -> Path:
+    """Return `notebooks` or `data_manifests`, beside the package in a clone, and inside of an installed one."""
+    inside = _PACKAGE / folder
+    return inside if inside.is_dir() else _PACKAGE.parent / folder
+
+
+def project_root() -> Path:
+    """Return the folder with `data/` and `runs/`: the clone; of an installed package, the nearest one from here up."""
+    if not (_PACKAGE / "notebooks").is_dir():
+        return _PACKAGE.parent
+    here = Path.cwd()
+    return next((folder for folder in (here, *here.parents) if (folder / "data_manifests").is_dir()), here)
+
+
 RUN_FILES = ("notebooks", "report.html", "run.json", "run.log", "submission.csv", "submission.zip")
 """Files and folders of a run beside its scenes; no scene can have one of these names."""
 

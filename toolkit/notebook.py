@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 import sys
+import time
 from collections.abc import Callable, Iterable, Mapping
 from html import escape
 from importlib import import_module
@@ -25,7 +26,16 @@ from pydantic import BeforeValidator, ConfigDict, Field, NonNegativeInt, Validat
 
 from toolkit import errors
 from toolkit.errors import CaptureError, ManifestError, StageError, shortage
-from toolkit.files import SceneFiles, link_folder, older_files, read_json, relative_url, write_text
+from toolkit.files import (
+    SceneFiles,
+    link_folder,
+    older_files,
+    project_root,
+    read_json,
+    relative_url,
+    shipped,
+    write_text,
+)
 from toolkit.manifest import (
     OPTIONAL,
     STAGES,
@@ -51,7 +61,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
+NOTEBOOKS = shipped("notebooks")
 Say = Callable[..., None]
 """Function that prints the progress lines of a run; called like `print`."""
 DEMO_RUN = "runs/demo"
@@ -137,7 +147,7 @@ def start(
     if taken_from is not None and stages:
         sessions_root = stages[0]["parameters"].get("sessions_root")
         by_hand = taken_from.with_name(f"{taken_from.name}-by-hand")
-    elif taken_from is not None and taken_from != (_root() / DEMO_RUN).resolve():
+    elif taken_from is not None and taken_from != (project_root() / DEMO_RUN).resolve():
         from toolkit.results.opening import no_such_run  # takes half a second, for an error alone
 
         raise no_such_run(taken_from)
@@ -146,7 +156,7 @@ def start(
     sessions = sessions_or_demo(sessions_root)
     _check_devices_and_queries(stage, sessions)
     scene = sessions.parent.name
-    files = SceneFiles(by_hand or _root() / "runs" / f"{scene}-by-hand", scene)
+    files = SceneFiles(by_hand or project_root() / "runs" / f"{scene}-by-hand", scene)
     source = taken_from or _finished_run(files.run.parent, scene)
     if None in folders.values():
         _take_from_run(stage, files, source)
@@ -164,7 +174,7 @@ def start(
 def find_run(run: str | Path) -> Path:
     """Return a run folder: as given, relative to the notebook, or else relative to the repository."""
     path = Path(run).expanduser()
-    return path.resolve() if path.is_absolute() or path.is_dir() else (_root() / path).resolve()
+    return path.resolve() if path.is_absolute() or path.is_dir() else (project_root() / path).resolve()
 
 
 def _require_outside_of_runs(name: str, folder: Path) -> None:
@@ -181,7 +191,7 @@ def sessions_or_demo(sessions_root: str | None) -> Path:
         return Path(sessions_root).expanduser().resolve()
     from toolkit.synthetic import render_capture
 
-    return render_capture(_root() / "data" / "demo", **DemoData(hard=True).model_dump()) / "sessions"
+    return render_capture(project_root() / "data" / "demo", **DemoData(hard=True).model_dump()) / "sessions"
 
 
 def own_folder(folder: str | None, scene: str, images: str | None = None) -> Path:
@@ -195,13 +205,9 @@ def own_folder(folder: str | None, scene: str, images: str | None = None) -> Pat
     if folder is not None:
         return Path(folder).expanduser().resolve()
     if images is None:
-        return _root() / "data" / scene
+        return project_root() / "data" / scene
     beside = Path(images).expanduser().resolve()
     return beside.with_name(f"{beside.name}-localized")
-
-
-def _root() -> Path:
-    return NOTEBOOKS.parent if NOTEBOOKS.is_dir() else Path.cwd()
 
 
 def readable(table: "pd.DataFrame", unit: str = "m") -> "pd.DataFrame":
@@ -321,9 +327,26 @@ def notebook_path(stage: str) -> Path:
     """Return the notebook of a stage, `<number>_<stage>.ipynb`, or `start.ipynb`."""
     path = next(iter(sorted([*NOTEBOOKS.glob(f"[0-9]*_{stage}.ipynb"), *NOTEBOOKS.glob(f"{stage}.ipynb")])), None)
     if path is None:
-        do = "Install the toolkit in a clone of its repository: `pip install --editable .`."
-        raise ManifestError.at(NOTEBOOKS, f"no notebook for the stage {stage}", do=do)
+        raise ManifestError.at(NOTEBOOKS, f"no notebook for the stage {stage}", do="Install the toolkit again.")
     return path
+
+
+def copy_notebooks(folder: Path) -> list[str]:
+    """Copy the notebooks into a folder for a person to change; return a sentence per notebook that is newer there.
+
+    A newer notebook replaces a copy only if the person has not changed it.
+    """
+    before = folder / ".from"
+    before.mkdir(parents=True, exist_ok=True)
+    kept = []
+    for new in sorted(NOTEBOOKS.glob("*.ipynb")):
+        mine, earlier = folder / new.name, before / new.name
+        if not mine.exists() or (earlier.exists() and mine.read_bytes() == earlier.read_bytes()):
+            shutil.copyfile(new, mine)
+            shutil.copyfile(new, earlier)
+        elif earlier.exists() and earlier.read_bytes() != new.read_bytes():
+            kept.append(f"{new} is newer than {mine}, which you have changed: delete yours to take it.")
+    return kept
 
 
 def notebook_parameters(path: Path) -> dict[str, Any]:
@@ -602,13 +625,17 @@ def _literals(source: str) -> dict[str, Any]:
     return values
 
 
+SHARE_EVERY_S = 30.0
+"""Seconds between lines about the progress of a stage where there is no terminal."""
+
+
 class StatusLine:
-    """The progress line of a running stage. On a terminal it repeats the progress bar of the kernel."""
+    """The progress of a running stage: on a terminal, the progress bar of the kernel; in a log, a line now and then."""
 
     def __init__(self, head: str, say: Say) -> None:
         self.head, self.say = head, say
-        # Not on a terminal, or with another `say`, the line is written only once.
         self.live = say is print and sys.stdout.isatty()
+        self.said = time.monotonic()
         say(f"{head} ...", end="", flush=True)
         log.info("%s ...", head)
 
@@ -618,13 +645,18 @@ class StatusLine:
         if self.live and lines:
             width = shutil.get_terminal_size().columns - 1
             self.say(f"\r{f'{self.head} ... {lines[-1].strip()}'[:width]}\033[K", end="", flush=True)
+        elif lines and "%|" in lines[-1] and time.monotonic() - self.said > SHARE_EVERY_S:
+            share = re.sub(r"\|[^|]*\|", "", lines[-1].strip())  # without the bar itself
+            self.say(f"\n  {share}", end="", flush=True)
+            log.info("%s  %s", self.head, share)
+            self.said = time.monotonic()
 
     def flush(self) -> None:
         """Do nothing: `write` shows its text at once."""
 
     def end(self, text: str) -> None:
         """Replace the progress by the stage's result."""
-        self.say(f"\r{self.head}  {text}\033[K" if self.live else f"  {text}")
+        self.say(f"\r{self.head}  {text}\033[K" if self.live else f"  {text}", flush=True)
         log.info("%s  %s", self.head, text)
 
 

@@ -23,7 +23,7 @@ from toolkit.capture.devices import extra_devices, table_record
 from toolkit.capture.names import allow_outside
 from toolkit.embedders import WEIGHTS as EMBEDDER_WEIGHTS
 from toolkit.embedders import resolve_model
-from toolkit.errors import ArtifactError, ManifestError, StageError, ToolkitError, exit_code, sentence
+from toolkit.errors import ArtifactError, ManifestError, StageError, ToolkitError, exit_code, require_packages, sentence
 from toolkit.exchange.download import is_unfinished
 from toolkit.features.matching import local_weights, resolve_auto
 from toolkit.files import (
@@ -33,6 +33,7 @@ from toolkit.files import (
     fingerprint,
     of_sequence,
     older_files,
+    project_root,
     read_json,
     write_text,
 )
@@ -44,13 +45,13 @@ from toolkit.manifest import (
     RerankSettings,
     RetrieveSettings,
     Settings,
+    find_manifest,
     load_manifest,
     nearest,
 )
 from toolkit.models.weights import WeightsSource, check_weights, find_weights, resolve_weights
 from toolkit.notebook import (
     DEMO_RUN,
-    NOTEBOOKS,
     UPSTREAM,
     Say,
     StatusLine,
@@ -68,14 +69,11 @@ from toolkit.runs.cluster import open_cluster
 from toolkit.runs.folder import LOG, OLDER, RECORD, RunLog, counts_text, failures, held, warnings_of_kernels
 from toolkit.runs.kernel import Kernels
 from toolkit.runs.sweep import changed_keys, swept_runs, take_over, variant_name
-from toolkit.sequences.pose_graph import require_gtsam
 
 if TYPE_CHECKING:
     from toolkit.scene.run import Run
 
 log = logging.getLogger(__name__)
-
-_DEMO, _DEMO_RUN = NOTEBOOKS.parent / "data_manifests" / "demo.yaml", (NOTEBOOKS.parent / DEMO_RUN).resolve()
 
 MAP = "map"
 """In place of a stage: build the maps for queries to come."""
@@ -142,8 +140,8 @@ def open_run(folder: str | Path, notebook: str = "start") -> "Run":
 
     check_given(notebook)
     path = find_run(folder)
-    if not (path / RECORD).is_file() and path == _DEMO_RUN:
-        run(_DEMO)
+    if not (path / RECORD).is_file() and _is_demo(path):
+        run(find_manifest("demo"))
     return Run.open(path)
 
 
@@ -165,14 +163,19 @@ def runs_to_compare(folder: str | Path, others: Sequence[str | Path] | None = No
     def beside() -> list[Path]:
         return sorted(record.parent for record in first.parent.glob(f"{first.name}-*/{RECORD}"))
 
-    if not beside() and first == _DEMO_RUN:
-        _, failed = sweep(_DEMO, ["localize.features=sift"], ["name=demo", "visualize.recordings=false"])
+    if not beside() and _is_demo(first):
+        demo = find_manifest("demo")
+        _, failed = sweep(demo, ["localize.features=sift"], ["name=demo", "visualize.recordings=false"])
         for error in failed:
             raise error
     if not beside():
         do = f"Name runs, or make one: python -m toolkit run MANIFEST --sweep key=a,b makes {first.name}-key-a."
         raise ArtifactError.at("others", f"no run beside {first}", "runs to compare with it", do)
     return [first, *beside()]
+
+
+def _is_demo(run_dir: Path) -> bool:
+    return run_dir == (project_root() / DEMO_RUN).resolve()
 
 
 def run(
@@ -194,7 +197,8 @@ def run(
 
     Args:
         manifest_path: YAML file, see `toolkit.manifest`.
-        only: run only this stage, on the results of earlier stages; or `map`: build the maps without queries.
+        only: run only this stage, or these, separated by commas, on the results of earlier stages; or `map`: build the
+            maps without queries.
         force: also execute stages that are up to date, without reuse of their own results.
         overrides: `key=value` or `stage.key=value`, replace values of the manifest.
         say: prints progress lines; called like `print`.
@@ -246,10 +250,11 @@ def run_name(
 
 def _check(manifest: Manifest, manifest_path: str | Path, only: str | None) -> None:
     """Raise ManifestError for what can be seen to fail before anything runs."""
-    if only is not None and only not in (*STAGES, MAP):
-        raise ManifestError(f"--only {only}: no such stage. {nearest(only, (*STAGES, MAP))}")
-    if only not in (None, MAP, *manifest.stages):
-        raise ManifestError(f"--only {only}: {manifest_path} has no section `{only}`, so the stage is off.")
+    for stage in _stages(only):
+        if stage not in STAGES and only != MAP:
+            raise ManifestError(f"--only {only}: no such stage. {nearest(stage, (*STAGES, MAP))}")
+        if stage not in manifest.stages and only != MAP:
+            raise ManifestError(f"--only {only}: {manifest_path} has no section `{stage}`, so the stage is off.")
     fetch = f"python -m toolkit download {manifest_path}"
     for capture in map(Path, manifest.captures):
         if is_unfinished(capture):
@@ -262,6 +267,10 @@ def _check(manifest: Manifest, manifest_path: str | Path, only: str | None) -> N
             check_names(manifest.stage(stage))
         except ManifestError as error:
             raise ManifestError(f"{manifest_path}: {stage}: {error}") from None
+
+
+def _stages(only: str | None) -> list[str]:
+    return [] if only is None else [stage.strip() for stage in only.split(",")]
 
 
 def sweep(
@@ -309,9 +318,10 @@ def sweep(
 
 def _run(manifest: Manifest, only: str | None, force: bool, say: Say, cluster: str | None) -> Path:
     run_dir = Path(manifest.output_root) / manifest.name
-    stages = [*_FOR_MAP] if only == MAP else [only] if only else [one for one in STAGES if one in manifest.stages]
-    if "sequence" in stages:
-        require_gtsam()
+    chosen = _FOR_MAP if only == MAP else _stages(only) or manifest.stages
+    stages = [one for one in STAGES if one in chosen]
+    needed = {"sequence": "gtsam", "visualize": "rerun"}
+    require_packages(*([] if only == MAP else ["papermill"]), *(needed[one] for one in stages if one in needed))
     for stage in stages:
         if not any(run_dir.glob(f"*/.stages/{stage}.json")):
             _require_weights(stage, manifest.stage(stage))

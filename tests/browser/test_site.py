@@ -24,17 +24,37 @@ class Quiet(SimpleHTTPRequestHandler):
         pass
 
 
-def test_pages_need_no_other_machine_and_fit_a_phone(browser: "Browser", tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def site(browser: "Browser", tmp_path_factory: pytest.TempPathFactory) -> Path:
     for package in ("latex2mathml", "material", "mkdocstrings"):
         pytest.importorskip(package, reason=f"{package} is missing: run `make docs-setup`")
-    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
+    folder = tmp_path_factory.mktemp("site")
+    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
     subprocess.run(build, cwd=ROOT, check=True)
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(tmp_path))) as server:
+    return folder
+
+
+def test_navigation_and_search_from_the_disk(browser: "Browser", site: Path) -> None:
+    context = browser.new_context(viewport={"width": 1200, "height": 900})
+    page = context.new_page()
+    traffic = chromium.watch(page)
+    page.goto((site / "index.html").as_uri())
+    for link in ("Your own images", "Troubleshooting", "Reliability"):
+        page.locator(".md-sidebar--primary").get_by_role("link", name=link).wait_for(state="visible")
+    page.fill(".md-search__input", "odometry")
+    page.locator(".md-search-result__link", has_text="Odometry").first.click()
+    page.wait_for_url("**/*.html?h=odometry*")
+    assert not (traffic.outside + traffic.errors)
+    context.close()
+
+
+def test_pages_need_no_other_machine_and_fit_a_phone(browser: "Browser", site: Path) -> None:
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(site))) as server:
         Thread(target=server.serve_forever, daemon=True).start()
         context = browser.new_context(viewport={"width": 390, "height": 800})
         page = context.new_page()
         traffic = chromium.watch(page)
-        names = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.html"))
+        names = sorted(path.relative_to(site).as_posix() for path in site.rglob("*.html"))
         assert len(names) > 25
         for name in names:
             page.goto(f"http://127.0.0.1:{server.server_port}/{name}")

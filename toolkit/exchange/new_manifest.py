@@ -10,9 +10,9 @@ from pathlib import Path
 from toolkit.capture import Capture
 from toolkit.capture.check import ASKED, check_capture
 from toolkit.errors import ManifestError
-from toolkit.files import write_text
+from toolkit.files import shipped, write_text
 
-TEMPLATE = Path(__file__).resolve().parents[2] / "data_manifests" / "my-capture.yaml"
+TEMPLATE = shipped("data_manifests") / "my-capture.yaml"
 MAX_PROBLEMS = 10
 
 
@@ -37,7 +37,7 @@ def new_manifest(
     if path.exists():
         raise ManifestError(f"{path} exists already. Give another name, or remove it first.")
     if not TEMPLATE.is_file():
-        raise ManifestError(f"{TEMPLATE}: no such file. Run this command in a clone of the repository.")
+        raise ManifestError(f"{TEMPLATE}: no such file. Install the toolkit again.")
     head = [f"# {name}. `python -m toolkit settings` lists all other settings."]
     template = TEMPLATE.read_text(encoding="utf-8").splitlines()
     lines = list(dropwhile(lambda line: line.startswith("# "), template))  # its first comment explains how to copy it

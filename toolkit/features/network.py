@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from toolkit.errors import ToolkitError
+from toolkit.errors import ToolkitError, optional
 from toolkit.features.features import LocalFeatures
 from toolkit.files import Remade
 from toolkit.manifest import AlikedSettings, SuperPointSettings
@@ -202,12 +202,7 @@ class SuperPointExtractor(NetworkExtractor):
     defaults = SuperPointSettings()
 
     def _load(self, checkpoint: str | Path | Mapping[str, Tensor] | None) -> nn.Module:
-        try:
-            import transformers
-        except ImportError as error:
-            fault = f"{SUPERPOINT.model} needs the package transformers, which cannot be imported ({error})"
-            install = "python -m pip install --constraint constraints.txt --editable '.[learned]'"
-            raise ToolkitError(f"{fault}. In the folder of this project: {install}. Or use `sift` features.") from error
+        transformers = optional("transformers")
         # `_forward` limits border and number of keypoints, because only it knows the unpadded size of the image.
         limits: Any = {"keypoint_threshold": self.min_response, "nms_radius": self.nms_radius}
         config = transformers.SuperPointConfig(**limits, max_keypoints=-1, border_removal_distance=0)

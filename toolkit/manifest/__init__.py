@@ -1,6 +1,6 @@
 """The manifest (what to run) and the tree of settings that all stages share."""
 
-from toolkit.manifest.loading import load_manifest
+from toolkit.manifest.loading import find_manifest, load_manifest
 from toolkit.manifest.manifest import OPTIONAL, STAGES, DatasetSettings, DemoData, Manifest, Source
 from toolkit.manifest.messages import nearest
 from toolkit.manifest.settings import (

@@ -11,9 +11,9 @@ import yaml
 from pydantic import ValidationError
 
 from toolkit.errors import ManifestError
-from toolkit.files import RUN_FILES
+from toolkit.files import RUN_FILES, shipped, write_text
 from toolkit.manifest.manifest import Manifest
-from toolkit.manifest.messages import explain
+from toolkit.manifest.messages import explain, nearest
 from toolkit.manifest.settings import expand, merge
 
 PATHS = ("captures", "output_root", "retrieve.mask.poses")
@@ -60,6 +60,32 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
         if name in RUN_FILES or names.count(name) > 1:
             raise ManifestError.at(f"{source}: captures", found, do="Rename one, or name a link to it.")
     return manifest
+
+
+def find_manifest(given: str | Path) -> Path:
+    """Return the path of a manifest that is given by its path or by its name, such as `demo`.
+
+    One that is not here but comes with the toolkit is copied to `data_manifests/` first, with those that it inherits,
+    so that its data and runs are here, too, and a user can see and change it.
+
+    Raises:
+        ManifestError: there is none; names those with a similar name.
+    """
+    path, folder = Path(given), Path("data_manifests")
+    name = path.name if path.suffix in (".yaml", ".yml") else f"{path.name}.yaml"
+    if path.is_file() or path.parent not in (Path(), folder):
+        return path
+    if (folder / name).is_file():
+        return folder / name
+    own = shipped("data_manifests")
+    if not (own / name).is_file():
+        known = sorted({one.stem for one in (*folder.glob("*.yaml"), *own.glob("*.yaml"))})
+        raise ManifestError(f"{given}: no such manifest. {nearest(Path(name).stem, known)}")
+    for file, _ in reversed(_read_chain(own / name, ())):
+        target = folder / os.path.relpath(file, own)
+        if not target.exists():
+            write_text(target, file.read_text(encoding="utf-8"))
+    return folder / name
 
 
 Chain = list[tuple[Path, dict[str, Any]]]
@@ -114,7 +140,7 @@ def _read_yaml(path: Path, heir: Path | None = None) -> dict[str, Any]:
     try:
         raw = _parse_yaml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ManifestError(f"{where}: no such manifest. data_manifests/demo.yaml is an example.") from None
+        raise ManifestError(f"{where}: no such manifest. `demo` is an example.") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ManifestError(f"{where}: cannot be read as a text file ({error}).") from None
     except yaml.YAMLError as error:

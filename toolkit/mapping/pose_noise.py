@@ -21,6 +21,7 @@ MIN_PAIRS = 6  # for an estimate
 INDEPENDENT = 20.0  # number of independent matches of a pair, as errors of neighbors are alike
 MIN_PARALLAX_DEG = 0.3  # of a match that tells the depth of its point; others count as infinitely far
 MIN_ERROR = 2e-4  # radians; least scale of the errors of matches
+SAME_SCALE = 2.0  # factor on the scale of the errors below which most matches agree with the poses as they are
 FREEDOM = 5.0  # degrees of freedom of Student's distribution, in which a few pairs may be wrong
 ROTATION_GRID_DEG = (0.0, *np.geomspace(0.02, 4, 18))
 POSITION_GRID = (0.0, *np.geomspace(0.001, 0.4, 18))  # map lengths
@@ -160,10 +161,11 @@ class SurveyedPairs:
             jacobian, errors = derivatives[rows][valid], all_errors[rows][valid]
             motion = np.zeros(6)
             for _ in range(8):  # to the motion without which the errors are those of the matches alone
-                rest = errors - jacobian @ motion
-                scale = max(1.48 * float(np.median(np.abs(rest))), MIN_ERROR)
-                weighted = jacobian * (1 / (1 + (rest / (2 * scale)) ** 2) / scale**2)[:, None]
+                scale, weighted = _robust(jacobian, errors - jacobian @ motion)
                 motion = np.linalg.solve(weighted.T @ jacobian + 100 * np.eye(6), weighted.T @ errors)
+            stated_scale, stated_weighted = _robust(jacobian, errors)
+            if stated_scale < SAME_SCALE * scale:  # the motion serves a minority, such as windows matched to others
+                weighted = stated_weighted
             share = min(1.0, INDEPENDENT / len(errors))
             parts.append((share * weighted.T @ jacobian, share * weighted.T @ errors))
         return parts
@@ -221,6 +223,12 @@ class SurveyedPairs:
             squares = float(change[columns] @ np.linalg.pinv(covariance, hermitian=True) @ change[columns])
             by_chance.append(float(fdtrc(len(columns), freedom, max(squares, 0.0) / len(columns))))
         return _Fit(change, max(by_chance), float(self.medians(change).mean()))
+
+
+def _robust(jacobian: Floats, errors: Floats) -> tuple[float, Floats]:
+    """Return the scale of errors (K,), and their derivatives (K, 6) times weights of Cauchy's distribution."""
+    scale = max(1.48 * float(np.median(np.abs(errors))), MIN_ERROR)
+    return scale, jacobian * (1 / (1 + (errors / (2 * scale)) ** 2) / scale**2)[:, None]
 
 
 class _Fit(NamedTuple):

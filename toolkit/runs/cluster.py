@@ -22,7 +22,7 @@ from toolkit import __version__
 from toolkit.capture.devices import EXTRA_DEVICES
 from toolkit.capture.images import WORKERS, default_workers
 from toolkit.capture.names import ALLOW_OUTSIDE
-from toolkit.errors import ManifestError, ToolkitError, first_line
+from toolkit.errors import ManifestError, ToolkitError, first_line, optional
 from toolkit.files import environment_variable
 from toolkit.threads import fixed_sums
 
@@ -33,7 +33,6 @@ log = logging.getLogger(__name__)
 
 ADDRESS = "TOOLKIT_CLUSTER"
 """Environment variable with the address of the scheduler whose workers the stages use."""
-MISSING = "--cluster needs Dask. To install it, run in the clone of the toolkit: pip install -e '.[cluster]'"
 SHARES_A_WORKER = 4
 """Shares per worker: small enough that all workers end at about the same time, and that a lost share costs little."""
 QUEUES = ("HTCondor", "LSF", "Moab", "OAR", "PBS", "SGE", "SLURM")
@@ -182,10 +181,7 @@ def open_cluster(spec: str | None, say: Callable[[str], object] = print) -> Iter
     if spec is None:
         yield
         return
-    try:
-        import distributed  # noqa: F401
-    except ImportError:
-        raise ManifestError(MISSING) from None
+    optional("distributed")
     with ExitStack() as stack:
         address, link = _start(spec, stack)
         try:
@@ -244,10 +240,7 @@ def _queued_cluster(queue: str, path: Path) -> Any:
     """Start workers through a queue such as SLURM, with the options in a YAML file."""
     import yaml
 
-    try:
-        import dask_jobqueue
-    except ImportError:
-        raise ManifestError(MISSING) from None
+    dask_jobqueue = optional("dask_jobqueue")
     try:
         options = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:

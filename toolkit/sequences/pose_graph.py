@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolkit import geometry
-from toolkit.errors import ArtifactError, ManifestError
+from toolkit.errors import ArtifactError, optional
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import SequenceSettings
 from toolkit.sequences.odometry import (
@@ -26,10 +26,6 @@ from toolkit.sequences.odometry import (
     with_measured_drift,
 )
 
-MISSING = (
-    "The stage `sequence` needs GTSAM, which is not installed. To install it, run in the clone of the toolkit: "
-    "pip install -e '.[sequence]'"
-)
 _CHI2_999 = 22.46
 """99.9 % quantile of the chi-squared distribution with 6 degrees of freedom."""
 _ROUNDS = 8
@@ -143,7 +139,7 @@ def _optimized(odometry: Odometry, queries: PosedQueries, settings: SequenceSett
     Raises:
         ArtifactError: the linear system is singular in float64.
     """
-    gtsam = require_gtsam()
+    gtsam = optional("gtsam")
     graph, values = _motion_graph(odometry, queries, settings), gtsam.Values()
     for number, pose in enumerate(first_guess(odometry, queries)):
         values.insert(number, gtsam.Pose3(_rigid(pose)))
@@ -160,7 +156,7 @@ def _optimized(odometry: Odometry, queries: PosedQueries, settings: SequenceSett
 
 def _motion_graph(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> Any:
     """Return GTSAM's graph of N poses, with factors for odometry steps and poses of queries."""
-    gtsam = require_gtsam()
+    gtsam = optional("gtsam")
     graph = gtsam.NonlinearFactorGraph()
     steps = geometry.invert(odometry.odom_from_rig[:-1]) @ odometry.odom_from_rig[1:]
     first: Ints = np.arange(len(steps))
@@ -183,16 +179,3 @@ def _motion_graph(odometry: Odometry, queries: PosedQueries, settings: SequenceS
 def _rigid(pose: Floats) -> Floats:
     """Return a pose (4, 4) with an exact rotation; rotations in files are rounded."""
     return geometry.pose_from_qt(geometry.qt_from_pose(pose))
-
-
-def require_gtsam() -> Any:
-    """Import and return GTSAM.
-
-    Raises:
-        ManifestError: it is not installed.
-    """
-    try:
-        import gtsam
-    except ImportError:
-        raise ManifestError(MISSING) from None
-    return gtsam

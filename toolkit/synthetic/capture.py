@@ -68,9 +68,9 @@ def _night(picture: Image, rng: Rng) -> Image:
     return np.clip(0.05 * picture + 4 * rng.standard_normal(picture.shape) + 0.5, 0, 255).astype(np.uint8)
 
 
-def _shaken(picture: Image, rng: Rng, length: int) -> Image:
-    """Blur a picture along a line of `length` pixels, 17 degrees from the horizontal."""
-    reach = 0.5 * (length - 1) * np.array([np.cos(0.3), np.sin(0.3)])
+def shaken(picture: Any, length: int, angle: float = 0.3) -> Any:
+    """Blur a picture along a line of `length` pixels, at an angle (radians) from the horizontal."""
+    reach = 0.5 * (length - 1) * np.array([np.cos(angle), np.sin(angle)])
     middle, kernel = length // 2, np.zeros((length, length), np.float32)
     start, end = (np.round(middle + side * reach).astype(int).tolist() for side in (-1, 1))
     cv2.line(kernel, start, end, 1.0)
@@ -79,7 +79,7 @@ def _shaken(picture: Image, rng: Rng, length: int) -> Image:
 
 HARD: dict[str, Callable[[Image, Rng], Image] | None] = {
     "night": _night,
-    "blurred": partial(_shaken, length=33),
+    "blurred": lambda picture, _: shaken(picture, 33),
     "two-places": None,
     "torn": None,
     "wrong-focal": None,
@@ -122,7 +122,7 @@ class Tables:
         """Add the sensors of a frame; return the id of the camera or rig to be posed, and body_from_device (4, 4)."""
         if name == "ios":  # a phone refocuses for each image, so each image has its own intrinsics
             (sensor,) = device.sensors
-            sensor_id, *_ = _names(name, sensor, subsession, timestamp)
+            sensor_id, *_ = names_of(name, sensor, subsession, timestamp)
             params = [round(f * zoom, 3) for f in sensor.params[:2]] + list(sensor.params[2:])
             label = f"phone camera for timestamp {timestamp}"
             self.sensors[sensor_id] = (sensor_id, label, "camera", sensor.model, *sensor.size, *params)
@@ -131,14 +131,14 @@ class Tables:
         assert device.rig_from_body is not None
         rig_from_body = pose_from_qt(device.rig_from_body)
         for sensor in device.sensors:
-            sensor_id, *_ = _names(name, sensor, subsession, timestamp)
+            sensor_id, *_ = names_of(name, sensor, subsession, timestamp)
             label = sensor_id.removeprefix(f"{subsession}/")
             self.sensors[sensor_id] = (sensor_id, label, "camera", sensor.model, *sensor.size, *sensor.params)
             self.rigs.append((timestamp, rig_id, sensor_id, rig_from_body @ sensor.body_from_cam))
         return rig_id, invert(rig_from_body)
 
 
-def _subsession(name: str, split: str, part: int, hours: int) -> tuple[str, int]:
+def subsession_of(name: str, split: str, part: int, hours: int) -> tuple[str, int]:
     """Return a subsession's name and its start on the device's clock, microseconds."""
     offset_s = (2 * part + (split == "query")) * hours * 3600 + {"ios": 0, "hl": 600, "spot": 1200}[name]
     offset_us = offset_s * 10**6
@@ -151,7 +151,7 @@ def _subsession(name: str, split: str, part: int, hours: int) -> tuple[str, int]
     return time.strftime("spot_%Y-%m-%d-%H-%M", date), start_us
 
 
-def _names(name: str, sensor: Sensor, subsession: str, timestamp: int) -> tuple[str, str, str]:
+def names_of(name: str, sensor: Sensor, subsession: str, timestamp: int) -> tuple[str, str, str]:
     """Return a sensor's id, the folder of its images and the file stem of the image at a timestamp."""
     if name == "ios":
         return f"{subsession}/cam_phone_{timestamp}", "images/", str(timestamp)
@@ -168,7 +168,7 @@ def _plan_room(world: World, scene: Scene, index: int, tables: dict[str, Tables]
     for name, device in DEVICES.items():
         for (split, part), bodies in walks(scene, world.seed, index, world.frames, name).items():
             session, table = f"{name}_{split}", tables[f"{name}_{split}"]
-            subsession, start = _subsession(name, split, part, world.hours)
+            subsession, start = subsession_of(name, split, part, world.hours)
             table.subsessions[subsession] = start
             rng = named_rng(world.seed, index, "frames", name, split, part)
             for i, world_from_body in enumerate(bodies):
@@ -182,7 +182,7 @@ def _plan_room(world: World, scene: Scene, index: int, tables: dict[str, Tables]
                 device_id, body_from_device = table.add_frame(name, device, subsession, timestamp, zoom)
                 table.poses.append((timestamp, device_id, world_from_body @ body_from_device))
                 for sensor in device.sensors:
-                    sensor_id, folder, stem = _names(name, sensor, subsession, timestamp)
+                    sensor_id, folder, stem = names_of(name, sensor, subsession, timestamp)
                     _, _, _, model, width, height, *params = table.sensors[sensor_id]
                     camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
                     path = f"{subsession}/{folder}{stem}.jpg"
@@ -212,13 +212,13 @@ def _take(shot: Shot, quads: list[Quad], rays: Rays | None, sessions: Path, seed
     noise = device.noise * rng.standard_normal(picture.shape, np.float32)
     image = np.clip(picture + noise + 0.5, 0, 255).astype(np.uint8)
     raw = sessions / shot.session / "raw_data"
-    _save(raw / shot.path, image, [cv2.IMWRITE_JPEG_QUALITY, device.quality])
+    save_image(raw / shot.path, image, [cv2.IMWRITE_JPEG_QUALITY, device.quality])
     if shot.depth_path is not None:
         millimeters = np.where(depth < 65.0, depth * 1000 + 0.5, 0).astype(np.uint16)
-        _save(raw / shot.depth_path, millimeters, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        save_image(raw / shot.depth_path, millimeters, [cv2.IMWRITE_PNG_COMPRESSION, 1])
 
 
-def _save(path: Path, image: Image, options: list[int]) -> None:
+def save_image(path: Path, image: Image, options: list[int]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     ok, encoded = cv2.imencode(path.suffix, image, options)
     if not ok:
@@ -238,7 +238,7 @@ def _add_hard(sessions: Path, world: World, table: Tables, elsewhere: Scene) -> 
     import pycolmap
 
     device, raw = DEVICES["ios"], sessions / "ios_query" / "raw_data"
-    subsession, start = _subsession("ios", "query", 2, world.hours)
+    subsession, start = subsession_of("ios", "query", 2, world.hours)
     table.subsessions[subsession] = start
     easy = [(table.sensors[row[1]], row[2], image[2]) for row, image in zip(table.poses, table.images, strict=True)]
     there = world.queries - world.queries // 2
@@ -266,7 +266,7 @@ def _add_hard(sessions: Path, world: World, table: Tables, elsewhere: Scene) -> 
                 half, other = picture.shape[1] // 2, cv2.imread(str(raw / easy[-1][2]))
                 assert other is not None
                 picture[:, half:] = other[:, half:]
-            _save(raw / path, picture, [cv2.IMWRITE_JPEG_QUALITY, device.quality])
+            save_image(raw / path, picture, [cv2.IMWRITE_JPEG_QUALITY, device.quality])
             if name == "torn":
                 whole = (raw / path).read_bytes()
                 (raw / path).write_bytes(whole[: len(whole) // 3])
