@@ -20,7 +20,7 @@ from toolkit.manifest import PnpSettings
 from toolkit.mapping.local_map import LocalMap
 from toolkit.pose import map_matching as matches
 from toolkit.pose import pnp
-from toolkit.pose.base import Prior
+from toolkit.pose.base import Prior, References
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import FIRST_REFERENCES, GUIDED_WEIGHT, VIEWS, PnpLocalizer, _Hypothesis
 from toolkit.pose.result import CAMERA, QueryResult
@@ -433,6 +433,27 @@ def test_a_rival_is_so_far_away_that_one_of_both_is_wrong(
     hypotheses = [_Hypothesis(geometry.invert(pose), none, 10.0) for pose in poses]
     rivals = room.localizer()._rivals(hypotheses)
     assert [rival.support for rival in rivals] == [1.0] * is_rival
+
+
+def test_a_pose_off_by_a_window_does_not_hide_the_one_that_fewer_matches_fit_closely(room: World) -> None:
+    """By the limits that both keep, the wrong pose has 75 inliers and the correct one 45, as on a facade by night."""
+    rng = np.random.default_rng(3)
+    wrong = QUERY @ facing(0.6, 0, 0, yaw_deg=-3)
+    pixels, points = [], []
+    for pose, count, noise_px in ((QUERY, 45, 0.3), (wrong, 75, 2.0), (QUERY, 300, 300.0)):
+        seen_at, _, seen = project(PINHOLE, geometry.invert(pose), room.points)
+        chosen = rng.permutation(len(seen))[:count]
+        pixels.append(seen_at[chosen] + noise_px * rng.normal(size=(len(chosen), 2)))
+        points.append(seen[chosen])
+    point = np.concatenate(points)
+    matches = Matches(np.zeros(len(point), np.int64), np.concatenate(pixels), point)
+    query, localizer = RigQuery([PINHOLE], np.eye(4)[None], [[room.look(PINHOLE, QUERY)]]), room.localizer()
+    first = localizer._ransac(query, matches, localizer.settings.ransac_max_error_deg)
+    assert first is not None
+    assert geometry.pose_error(geometry.invert(first), wrong)[1] < 0.1
+    hypotheses = [_Hypothesis(first, matches, 10.0)]
+    localizer._add_other_places(query, matches, [References.of([0])], hypotheses)
+    assert min(geometry.pose_error(one.world_from_rig, QUERY)[1] for one in hypotheses[1:]) < 0.02
 
 
 @pytest.mark.parametrize("unmapped", [0, 60])

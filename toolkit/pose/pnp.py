@@ -28,7 +28,7 @@ from toolkit.pose.result import CAMERA, Correspondences, QueryResult, Rival, Sta
 from toolkit.pose.rig import CELLS, Matches, RigQuery, least_squares_covariance
 from toolkit.threads import fixed_sums
 
-PNP_FORMAT = 5
+PNP_FORMAT = 6
 """Version of the poses. Increase when the same settings and files give other poses."""
 FIRST_REFERENCES = {2: 200, 4: 100}
 """Number of references per image to match first -> independent inliers that their pose needs to be kept. The next
@@ -44,6 +44,9 @@ separately for single references."""
 CONTESTED_REFERENCES = 4
 """How many references, those with the most matches, then get a RANSAC of their own: several similar-looking places
 together can outvote the one reference that shows the right place."""
+CLOSE = 0.35
+"""Of `max_error_deg`: correct matches fit their pose so closely, matches of one window with the next do not. By a limit
+that both keep, a pose that is off by a window can have more inliers than the correct one, and hide it."""
 MAX_RIVAL_SUPPORT = 0.8
 """A pose is `ok` only if the best rival pose has at most this fraction of its support. With the default
 `ok_probability` the limit is 0.7, see `confidence.py`."""
@@ -300,20 +303,22 @@ class PnpLocalizer(Localizer):
             if share < CONTESTED_INLIER_RATIO or count >= least:
                 hypotheses.append(self._improve(query, other, matches))
         if share < CONTESTED_INLIER_RATIO:
-            self._add_by_reference(query, matches, references, hypotheses)
+            self._add_other_places(query, matches, references, hypotheses)
         return sorted(hypotheses, key=lambda hypothesis: -hypothesis.support)
 
-    def _add_by_reference(
+    def _add_other_places(
         self, query: RigQuery, matches: Matches, references: Sequence[References], hypotheses: list[_Hypothesis]
     ) -> None:
-        """Add clearly different poses, found from the matches with single references."""
+        """Add clearly different poses, found from the matches with single references, or by closely fitting ones."""
         images = dict.fromkeys(int(index) for retrieved in references for index in retrieved.images)
         seen_in = {index: np.isin(matches.point, self.map.observations(index)[1]) for index in images}
         best = sorted(seen_in, key=lambda index: -int(seen_in[index].sum()))
-        for index in best[: CONTESTED_REFERENCES]:
-            start = self._ransac(query, matches[seen_in[index]], self.settings.ransac_max_error_deg, least_inliers=5)
+        limit_deg, close_deg = self.settings.ransac_max_error_deg, CLOSE * self.settings.max_error_deg
+        searches = [(matches[seen_in[index]], limit_deg, 5, 1.0) for index in best[: CONTESTED_REFERENCES]]
+        for some, max_error_deg, least, share in [*searches, (matches, close_deg, 0, 0.5)]:
+            start = self._ransac(query, some, max_error_deg, least_inliers=least)
             if start is not None and not any(
-                agree(hypothesis.world_from_rig, geometry.invert(start)) for hypothesis in hypotheses
+                agree(hypothesis.world_from_rig, geometry.invert(start), share) for hypothesis in hypotheses
             ):
                 hypotheses.append(self._improve(query, start, matches))
 
