@@ -16,7 +16,7 @@ from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import MATCHER_WEIGHTS, PairMatches
 from toolkit.features.network import NOT_FINITE
 from toolkit.files import Remade
-from toolkit.models.compute import Fitting, in_single_threads, on_device, precision_of_matches, resolve_device
+from toolkit.models.compute import Fitting, in_single_threads, on_device, resolve_device, resolve_precision
 from toolkit.models.lightglue import LightGlue, official_names
 from toolkit.models.weights import given_or_resolved, load_checkpoint, weights_digest
 
@@ -37,15 +37,15 @@ class LightGlueMatcher(Remade):
         checkpoint: str | Path | Mapping[str, Tensor] | None = None,
         device: str = "auto",
         dtype: str = "auto",
-        batch_size: int | None = None,
+        batch_size: int = 32,
         min_score: float = 0.1,
         features: str = "superpoint",
     ) -> None:
         """
         Args:
-            checkpoint, device, dtype: see `NetworkExtractor`; the file is one of the authors or of the hub. Positions
-                and the assignment are always computed in float32.
-            batch_size: largest number of pairs per batch; None: depends on the device.
+            checkpoint, device: see `NetworkExtractor`; the file is one of the authors or of the hub.
+            dtype: precision of the attention blocks, see `resolve_precision`.
+            batch_size: largest number of pairs per batch.
             min_score: smallest confidence of a match, from 0 to 1.
             features: kind of the features, `superpoint` or `aliked`.
 
@@ -61,9 +61,9 @@ class LightGlueMatcher(Remade):
         self._kind = features
         self._min_score = min_score
         self._device = resolve_device(device)
-        self._dtype = precision_of_matches(dtype, self._device)
+        self._dtype = resolve_precision(dtype, self._device)
         self._one_by_one = self._device.type == "cpu"
-        self.batch_size = batch_size or (8 if self._one_by_one else 32)
+        self.batch_size = batch_size
         source = MATCHER_WEIGHTS["lightglue", features]
         with torch.device("meta"):
             model = LightGlue(_DESCRIPTOR_LENGTHS[features])
