@@ -19,6 +19,7 @@ from toolkit.files import Remade
 from toolkit.models.compute import Fitting, in_single_threads, on_device, resolve_device, resolve_precision
 from toolkit.models.lightglue import LightGlue, official_names
 from toolkit.models.weights import given_or_resolved, load_checkpoint, weights_digest
+from toolkit.threads import release_memory
 
 _DESCRIPTOR_LENGTHS = {"superpoint": 256, "aliked": 128}
 
@@ -116,7 +117,9 @@ class LightGlueMatcher(Remade):
         if not self._one_by_one:
             return self._fitting_pairs(pad_sequence(list(states), batch_first=True).unflatten(0, (-1, 2)))
         pairs = zip(states[::2], states[1::2], strict=True)
-        return in_single_threads(lambda pair: self._forward_pairs(pair[0][None], pair[1][None])[0], pairs)
+        matches = in_single_threads(lambda pair: self._forward_pairs(pair[0][None], pair[1][None])[0], pairs)
+        release_memory()  # hundreds of megabytes, as the numbers of features differ after each layer
+        return matches
 
     def _check(self, features: LocalFeatures) -> None:
         dtype, shape, expected = features.descriptors.dtype, features.descriptors.shape, _DESCRIPTOR_LENGTHS[self._kind]

@@ -254,12 +254,12 @@ class LightGlue(nn.Module):
                 ropes[side] = ropes[side][0][:, kept], ropes[side][1][:, kept]
             if not all(map(len, rows)):
                 return partners, scores
-        best, confidence = self._assign(*states, *masks, number)
+        best, confidence = self._assign(states[0], states[1], *masks, number)
         best = rows[1][best].where(best >= 0, -1)
         return partners.index_copy_(1, rows[0], best), scores.index_copy_(1, rows[0], confidence)
 
     def _is_confident(self, states: Tensor, number: int) -> Tensor:
-        """Return whether the matches of features (N, DIM) after a layer are those of the last layer, (N,) bool."""
+        """Return which features (N, DIM) after a layer are confident that their match is the final one, (N,) bool."""
         confidence = self.token_confidence[number].token(states)[:, 0].sigmoid()
         return confidence > 0.8 + 0.1 * math.exp(-4 * number / _LAYERS)
 
