@@ -38,7 +38,7 @@ class LightGlueMatcher(Remade):
         checkpoint: str | Path | Mapping[str, Tensor] | None = None,
         device: str = "auto",
         dtype: str = "auto",
-        batch_size: int = 32,
+        batch_size: int | None = None,
         min_score: float = 0.1,
         features: str = "superpoint",
     ) -> None:
@@ -46,7 +46,7 @@ class LightGlueMatcher(Remade):
         Args:
             checkpoint, device: see `NetworkExtractor`; the file is one of the authors or of the hub.
             dtype: precision of the attention blocks, see `resolve_precision`.
-            batch_size: largest number of pairs per batch.
+            batch_size: largest number of pairs per batch; None: depends on the device.
             min_score: smallest confidence of a match, from 0 to 1.
             features: kind of the features, `superpoint` or `aliked`.
 
@@ -64,7 +64,7 @@ class LightGlueMatcher(Remade):
         self._device = resolve_device(device)
         self._dtype = resolve_precision(dtype, self._device)
         self._one_by_one = self._device.type == "cpu"
-        self.batch_size = batch_size
+        self.batch_size = batch_size or (8 if self._one_by_one else 32)
         source = MATCHER_WEIGHTS["lightglue", features]
         with torch.device("meta"):
             model = LightGlue(_DESCRIPTOR_LENGTHS[features])
@@ -116,10 +116,13 @@ class LightGlueMatcher(Remade):
         """Return the output of `_forward` for consecutive pairs of images, given by their output of `_encode`."""
         if not self._one_by_one:
             return self._fitting_pairs(pad_sequence(list(states), batch_first=True).unflatten(0, (-1, 2)))
-        pairs = zip(states[::2], states[1::2], strict=True)
-        matches = in_single_threads(lambda pair: self._forward_pairs(pair[0][None], pair[1][None])[0], pairs)
-        release_memory()  # hundreds of megabytes, as the numbers of features differ after each layer
-        return matches
+
+        def match_one(pair: tuple[Tensor, Tensor]) -> Tensor:
+            matches = self._forward_pairs(pair[0][None], pair[1][None])[0]
+            release_memory()  # hundreds of megabytes, as the numbers of features differ after each layer
+            return matches
+
+        return in_single_threads(match_one, zip(states[::2], states[1::2], strict=True))
 
     def _check(self, features: LocalFeatures) -> None:
         dtype, shape, expected = features.descriptors.dtype, features.descriptors.shape, _DESCRIPTOR_LENGTHS[self._kind]
