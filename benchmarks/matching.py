@@ -6,10 +6,10 @@
 Everything runs on the same features in one process, in turns, and the fastest of `--repeat` counts; CPU seconds are of
 that run, on all cores. All pairs have the same first image. `LightGlue, one at a time` and `LightGlue, batches of ...`
 are the same matcher with another `batch_size`; how many of their matches are the same is counted. Where kornia is
-installed, its LightGlue runs one pair at a time, without early stopping, in float32, beside ours in float32. `SIFT
-mutual` is `features.matching`, pair after pair; OpenCV's brute-force matcher does the same work (two nearest neighbors,
-ratio test, and mutual) on the same descriptors. Without a checkpoint LightGlue's weights are random: its time does not
-depend on them, as every layer runs for every pair.
+installed, its LightGlue runs one pair at a time, with the authors' early stop and dropping of features as ours, in
+float32, beside ours in float32. `SIFT mutual` is `features.matching`, pair after pair; OpenCV's brute-force matcher
+does the same work (two nearest neighbors, ratio test, and mutual) on the same descriptors. Without a checkpoint
+LightGlue's weights are random: then every layer runs for every pair.
 """
 
 import argparse
@@ -88,9 +88,7 @@ def kornia_matcher(weights: Any, kind: str) -> Callable[[list[tuple[Any, Any]]],
     from toolkit.models.lightglue import official_names
     from toolkit.models.weights import read_state_dict
 
-    network = LightGlue(
-        None, input_dim=256 if kind == "superpoint" else 128, depth_confidence=-1, width_confidence=-1
-    ).eval()
+    network = LightGlue(None, input_dim=256 if kind == "superpoint" else 128).eval()
     state = read_state_dict(weights) if isinstance(weights, str) else weights
     network.load_state_dict(official_names(state), strict=False)
 

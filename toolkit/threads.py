@@ -4,9 +4,10 @@ BLAS splits a sum by its number of threads, and rounds differently for each. Wha
 descriptors therefore runs with one BLAS thread; images and queries are the parallel dimension.
 """
 
+import ctypes
 import threading
 from collections.abc import Iterator
-from contextlib import ContextDecorator, contextmanager
+from contextlib import ContextDecorator, contextmanager, suppress
 
 import cv2
 from threadpoolctl import OpenBLASController, threadpool_limits
@@ -52,3 +53,9 @@ def one_thread() -> Iterator[None]:
             yield
     finally:
         cv2.setNumThreads(threads)
+
+
+def release_memory() -> None:
+    """Return memory that threads have freed to the system: glibc keeps it. Other C libraries have no malloc_trim."""
+    with suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)

@@ -16,7 +16,7 @@ from toolkit.features.features import LocalFeatures
 from toolkit.files import Remade
 from toolkit.manifest import AlikedSettings, SuperPointSettings
 from toolkit.models.aliked import Aliked, find_keypoints
-from toolkit.models.compute import Fitting, in_single_threads, on_device, precision_of_matches, resolve_device
+from toolkit.models.compute import Fitting, in_single_threads, on_device, resolve_device, resolve_precision
 from toolkit.models.weights import ALIKED, SUPERPOINT, given_or_resolved, load_checkpoint, weights_digest
 
 NOT_FINITE = "Its weights may hold NaN: compare the file with the official one. Or float16 overflowed: use bfloat16."
@@ -60,7 +60,9 @@ class NetworkExtractor(Remade):
         """
         self._values: Any = settings or self.defaults
         self._device = resolve_device(device)
-        self._dtype = precision_of_matches(dtype, self._device)
+        # All CPUs extract the same features.
+        dtype = "float32" if dtype == "auto" and self._device.type == "cpu" else dtype
+        self._dtype = resolve_precision(dtype, self._device)
         self.batch_size = batch_size or (self._batch_on_cpu() if self._device.type == "cpu" else 16)
         model = self._load(checkpoint)
         self._weights = weights_digest(model)

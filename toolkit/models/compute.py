@@ -91,15 +91,6 @@ def has_accelerator(name: str) -> bool:
     return resolve_device(name).type != "cpu"
 
 
-def precision_of_matches(name: str, device: "torch.device") -> "torch.dtype":
-    """Return the data type in which networks for local features compute.
-
-    As `resolve_precision`, but `auto` on a CPU is float32, so that all CPUs give the same matches. bfloat16 changes a
-    few percent of the matches.
-    """
-    return resolve_precision("float32" if name == "auto" and device.type == "cpu" else name, device)
-
-
 def cpu_multiplies_bfloat16() -> bool:
     """Tell whether this CPU has instructions for bfloat16 matrix products: AMX or AVX512-BF16.
 

@@ -1,9 +1,10 @@
 """The network LightGlue (Lindenberger, Sarlin and Pollefeys, ICCV 2023), with the key names of the authors' files.
 
-All layers run for all features, without the network's early stopping and pruning. Call `fold_` before use: it merges
-matrices that are only ever multiplied with each other. The result is equal up to rounding.
+Call `fold_` before use: it merges matrices that are only ever multiplied with each other. The result is equal up to
+rounding.
 """
 
+import math
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -19,6 +20,10 @@ DIM = 256
 """Channels of a feature inside the network."""
 _HEADS = 4
 _LAYERS = 9
+# The authors' defaults for adaptive depth and width (section 3.3 of the paper): a pair is done if this share of its
+# features is confident, and a confident feature is dropped if it has a match with less than this probability.
+_DEPTH_CONFIDENCE = 0.95
+_MIN_MATCHABILITY = 0.01
 # Rows of the attention matrix at a time, per CPU thread: they fit the cache.
 _ROWS = 128
 
@@ -183,8 +188,8 @@ class LightGlue(nn.Module):
             nn.ModuleDict({"matchability": nn.Linear(DIM, 1), "final_proj": nn.Linear(DIM, DIM)})
             for _ in range(_LAYERS)
         )
-        # Confidence of a feature's match after a layer: part of the checkpoints, but not used here.
-        self.token_confidence = nn.ModuleList(
+        # Confidence that a feature's match, or that it has none, does not change after a layer.
+        self.token_confidence: Any = nn.ModuleList(
             nn.ModuleDict({"token": nn.Sequential(nn.Linear(DIM, 1))}) for _ in range(_LAYERS - 1)
         )
 
@@ -214,7 +219,8 @@ class LightGlue(nn.Module):
         self,
         keypoints: tuple[Tensor, Tensor],
         encoded: tuple[Tensor, Tensor],
-        masks: tuple[Tensor | None, Tensor | None],
+        masks: tuple[Tensor | None, Tensor | None] = (None, None),
+        adaptive: bool = False,
     ) -> tuple[Tensor, Tensor]:
         """Return the match of each feature of the first images, -1 for none, and its confidence, each (B, N).
 
@@ -222,19 +228,49 @@ class LightGlue(nn.Module):
             keypoints: of both images, as in `encode`.
             encoded: features from `encode` of both images, (B, N, DIM) and (B, M, DIM).
             masks: (B, N) and (B, M), True for real features, at least one per image; None: all are real.
+            adaptive: stop early, and drop features that match nothing, as the authors' code does by default. Only for
+                B = 1 without masks.
         """
         ropes = [self._rope(xy) for xy in keypoints]
         attended = [None if mask is None else mask[:, None, None] for mask in masks]
-        a, b = encoded
+        states = list(encoded)
+        rows = [torch.arange(state.shape[1], device=state.device) for state in states]
+        partners, scores = rows[0].new_full(states[0].shape[:2], -1), states[0].new_zeros(states[0].shape[:2])
+        count = sum(map(len, rows))
         for number, layer in enumerate(self.transformers):
             if number:
-                a, b = (layer.self_attn(*inputs) for inputs in zip((a, b), ropes, attended, strict=True))
-            a, b = layer.cross_attn(a, b, *attended)
-        return self._assign(a, b, *masks)
+                states = [layer.self_attn(*inputs) for inputs in zip(states, ropes, attended, strict=True)]
+            states = list(layer.cross_attn(*states, *attended))
+            if not adaptive or number == _LAYERS - 1:
+                continue
+            confident = [self._is_confident(state[0], number) for state in states]
+            # Dropped features are confident.
+            if count - sum(int((~sure).sum()) for sure in confident) > _DEPTH_CONFIDENCE * count:
+                break
+            for side, (state, sure) in enumerate(zip(states, confident, strict=True)):
+                matchability = self.log_assignment[number].matchability(state[0])[:, 0].sigmoid()
+                kept = ~sure | (matchability > _MIN_MATCHABILITY)
+                states[side], rows[side] = state[:, kept], rows[side][kept]
+                ropes[side] = ropes[side][0][:, kept], ropes[side][1][:, kept]
+            if not all(map(len, rows)):
+                return partners, scores
+        best, confidence = self._assign(states[0], states[1], *masks, number)
+        best = rows[1][best].where(best >= 0, -1)
+        return partners.index_copy_(1, rows[0], best), scores.index_copy_(1, rows[0], confidence)
 
-    def _assign(self, a: Tensor, b: Tensor, mask_a: Tensor | None, mask_b: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return mutual best matches, see `forward`, by the sum of the log softmax over rows and over columns."""
-        layer = self.log_assignment[-1]
+    def _is_confident(self, states: Tensor, number: int) -> Tensor:
+        """Return which features (N, DIM) after a layer are confident that their match is the final one, (N,) bool."""
+        confidence = self.token_confidence[number].token(states)[:, 0].sigmoid()
+        return confidence > 0.8 + 0.1 * math.exp(-4 * number / _LAYERS)
+
+    def _assign(
+        self, a: Tensor, b: Tensor, mask_a: Tensor | None, mask_b: Tensor | None, number: int
+    ) -> tuple[Tensor, Tensor]:
+        """Return mutual best matches after a layer, by the sum of the log softmax over rows and over columns.
+
+        See `forward` for the shapes.
+        """
+        layer = self.log_assignment[number]
         scores = layer.final_proj(a) @ (layer.final_proj(b) / DIM**0.5).mT
         for mask, dim in ((mask_a, 2), (mask_b, 1)):
             if mask is not None:  # -inf would make the softmax of fully masked rows NaN

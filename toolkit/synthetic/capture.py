@@ -5,13 +5,11 @@ generator is seeded by the seed and the name of the thing it draws, not by the o
 on the number of cores.
 """
 
-import ctypes
 import json
 import shutil
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -29,6 +27,7 @@ from toolkit.synthetic.recording import PICTURE_S, RADIOS, RATE_HZ, emitters_of,
 from toolkit.synthetic.render import Rays, paint, render
 from toolkit.synthetic.scene import Quad, Scene, build_room, named_rng
 from toolkit.synthetic.textures import Image, Rng
+from toolkit.threads import release_memory
 
 if TYPE_CHECKING:
     import pycolmap
@@ -394,9 +393,7 @@ def _render(out: Path, world: World, settings: dict[str, int], progress: bool) -
             raise
     finally:
         cv2.setNumThreads(threads)
-        # glibc keeps memory that threads have freed. Other C libraries have no malloc_trim.
-        with suppress(AttributeError, OSError, TypeError):
-            ctypes.CDLL(None).malloc_trim(0)
+        release_memory()
     return out
 
 
