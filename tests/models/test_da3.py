@@ -67,12 +67,14 @@ def test_outputs_have_the_official_names_and_shapes(model: DepthAnything3, image
     assert model(images[0, :1, :, :14, :28])["depth"].shape == (1, 1, 14, 28)
 
 
+@pytest.mark.slow
 def test_scenes_of_a_batch_do_not_see_each_other(model: DepthAnything3, images: torch.Tensor) -> None:
     together = model(images)
     for scene in range(2):
         assert_equal(model(images[scene]), {name: value[scene : scene + 1] for name, value in together.items()})
 
 
+@pytest.mark.slow
 def test_only_the_reference_is_special(model: DepthAnything3, images: torch.Tensor) -> None:
     """Whatever the order of the views; asked for the first, whatever the order of the others."""
     output, moved = model(images), model(images[:, [3, 1, 0, 2]])

@@ -149,6 +149,7 @@ def test_loaded_tensors_are_not_changed(state: State) -> None:
     assert all(torch.equal(value, before[name]) for name, value in state.items())
 
 
+@pytest.mark.slow
 @torch.inference_mode()
 def test_padding_and_the_products_of_torch_change_nothing(network: LightGlue, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = run(network, (300, 41))
