@@ -54,6 +54,7 @@ def images() -> torch.Tensor:
 # The network
 
 
+@pytest.mark.slow
 def test_outputs_have_the_official_names_and_shapes(model: DepthAnything3, images: torch.Tensor) -> None:
     output = model(images)
     assert output.keys() == set.union(*KEYS.values())
@@ -108,6 +109,7 @@ def test_the_reference_is_in_the_middle_of_all_respects() -> None:
         choose_reference(tokens[None], "middle")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("heads", [("camera",), ("depth",)])
 def test_heads_asked_for_are_as_with_all(model: DepthAnything3, images: torch.Tensor, heads: tuple[str, ...]) -> None:
     everything = model(images)

@@ -95,6 +95,7 @@ def test_only_the_first_view_is_special(model: VGGTOmega, images: torch.Tensor) 
     assert not torch.allclose(model(images[:, :2])["pose_enc"], output["pose_enc"][:, :2], atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("heads", [("camera",), ("depth",)])
 def test_heads_asked_for_are_as_with_all(model: VGGTOmega, images: torch.Tensor, heads: tuple[str, ...]) -> None:
     everything = model(images)

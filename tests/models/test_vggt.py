@@ -151,6 +151,7 @@ def test_views_see_each_other(model: VGGT, images: torch.Tensor) -> None:
     assert not torch.allclose(model(images[:, :2])["pose_enc"], model(images)["pose_enc"][:, :2], atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("heads", [("camera",), ("depth",), ("point",), ("camera", "depth"), ("depth", "point")])
 def test_heads_asked_for_are_as_with_all(model: VGGT, images: torch.Tensor, heads: tuple[str, ...]) -> None:
     everything = model(images)
