@@ -10,6 +10,7 @@ BIN := $(VENV)/bin
 # A worker needs up to 2 GB (slow tests: 6). Tests of a module stay in one worker because they share slow fixtures.
 PYTEST := $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadscope
 
+OF_KIND := $(PYTEST) -m "not browser and not gpu"
 NUMBERS := $(addprefix tests/,alignment embedders features mapping models pose prediction scene sequences synthetic \
 	$(addsuffix .py,$(addprefix test_,accuracy benchmark_reader confidence embed evaluate geometry localize \
 	references_file rerank retrieve sequence threads)))
@@ -42,13 +43,13 @@ test-kernels: $(INSTALLED)  ## run the tests of numbers with other BLAS kernels 
 
 # All tests of a kind, default and slow. Together the three have every test that needs neither a browser nor a GPU.
 test-numbers: $(INSTALLED)  ## test what is computed: features, maps, poses, networks, errors, accuracy on captures
-	$(PYTEST) -m "slow or not slow and not browser and not gpu" $(NUMBERS)
+	$(OF_KIND) $(NUMBERS)
 
 test-faults: $(INSTALLED)  ## test wrong input, damaged files, kills, full disks, imports and exports
-	$(PYTEST) -m "slow or not slow and not browser and not gpu" $(FAULTS)
+	$(OF_KIND) $(FAULTS)
 
 test-notebooks: $(INSTALLED)  ## test notebooks, runs, figures, reports, recordings, the package and its pages
-	$(PYTEST) -m "slow or not slow and not browser and not gpu" $(NOTEBOOKS)
+	$(OF_KIND) $(NOTEBOOKS)
 
 test-slow: $(INSTALLED)  ## run the slow tests: whole runs, and accuracy on real captures if present
 	$(PYTEST) -m slow

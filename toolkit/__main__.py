@@ -262,7 +262,8 @@ def settings(branch: Annotated[str, Argument(help="Only these, e.g. localize or 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
 def lab(context: typer.Context) -> None:
     """Open JupyterLab on your own copies of the notebooks, in lab/; further options go to JupyterLab."""
-    from toolkit.notebook import copy_notebooks, shipped
+    from toolkit.files import shipped
+    from toolkit.notebook import copy_notebooks
 
     optional("jupyterlab")
     for message in copy_notebooks(Path("lab")):

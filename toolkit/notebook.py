@@ -147,7 +147,7 @@ def start(
     if taken_from is not None and stages:
         sessions_root = stages[0]["parameters"].get("sessions_root")
         by_hand = taken_from.with_name(f"{taken_from.name}-by-hand")
-    elif taken_from is not None and taken_from != (project_root() / DEMO_RUN).resolve():
+    elif taken_from is not None and not is_demo(taken_from):
         from toolkit.results.opening import no_such_run  # takes half a second, for an error alone
 
         raise no_such_run(taken_from)
@@ -175,6 +175,11 @@ def find_run(run: str | Path) -> Path:
     """Return a run folder: as given, relative to the notebook, or else relative to the repository."""
     path = Path(run).expanduser()
     return path.resolve() if path.is_absolute() or path.is_dir() else (project_root() / path).resolve()
+
+
+def is_demo(run: Path) -> bool:
+    """Tell whether a folder is that of the demo's run, whether it has run or not."""
+    return run == (project_root() / DEMO_RUN).resolve()
 
 
 def _require_outside_of_runs(name: str, folder: Path) -> None:

@@ -33,7 +33,6 @@ from toolkit.files import (
     fingerprint,
     of_sequence,
     older_files,
-    project_root,
     read_json,
     write_text,
 )
@@ -51,7 +50,6 @@ from toolkit.manifest import (
 )
 from toolkit.models.weights import WeightsSource, check_weights, find_weights, resolve_weights
 from toolkit.notebook import (
-    DEMO_RUN,
     UPSTREAM,
     Say,
     StatusLine,
@@ -60,6 +58,7 @@ from toolkit.notebook import (
     execute,
     find_run,
     handed_counts,
+    is_demo,
     notebook_parameters,
     notebook_path,
     work_seconds,
@@ -140,7 +139,7 @@ def open_run(folder: str | Path, notebook: str = "start") -> "Run":
 
     check_given(notebook)
     path = find_run(folder)
-    if not (path / RECORD).is_file() and _is_demo(path):
+    if not (path / RECORD).is_file() and is_demo(path):
         run(find_manifest("demo"))
     return Run.open(path)
 
@@ -163,7 +162,7 @@ def runs_to_compare(folder: str | Path, others: Sequence[str | Path] | None = No
     def beside() -> list[Path]:
         return sorted(record.parent for record in first.parent.glob(f"{first.name}-*/{RECORD}"))
 
-    if not beside() and _is_demo(first):
+    if not beside() and is_demo(first):
         demo = find_manifest("demo")
         _, failed = sweep(demo, ["localize.features=sift"], ["name=demo", "visualize.recordings=false"])
         for error in failed:
@@ -172,10 +171,6 @@ def runs_to_compare(folder: str | Path, others: Sequence[str | Path] | None = No
         do = f"Name runs, or make one: python -m toolkit run MANIFEST --sweep key=a,b makes {first.name}-key-a."
         raise ArtifactError.at("others", f"no run beside {first}", "runs to compare with it", do)
     return [first, *beside()]
-
-
-def _is_demo(run_dir: Path) -> bool:
-    return run_dir == (project_root() / DEMO_RUN).resolve()
 
 
 def run(

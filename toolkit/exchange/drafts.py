@@ -489,7 +489,7 @@ class Draft(Options):
             "poses": len(self.poses), "convention": f"{self.convention}, {_AXES[self.axes]}",
             "unit from": self.record.get("meters", self.unit_hint), "timestamps": [len(times), self.times_from],
             "masks": [len(masks), "no features where they are black"] if masks else None, "notes": self.notes,
-                    "odometry": [len(odometry), f"poses, from {self.odometry}"] if odometry is not None else None,
+            "odometry": [len(odometry), f"poses, from {self.odometry}"] if odometry is not None else None,
             "GPS": [len(fixes), f"fixes, from {self.fixes}"] if fixes else None,
             "depth maps": [len(depths), f"from {self.depth}"] if depths else None,
         } | self.record | {"up": by if posed else None}  # fmt: skip

@@ -159,13 +159,12 @@ class SurveyedPairs:
             if valid.sum() < MIN_MATCHES:
                 continue
             jacobian, errors = derivatives[rows][valid], all_errors[rows][valid]
-            motion = np.zeros(6)
-            for _ in range(8):  # to the motion without which the errors are those of the matches alone
-                scale, weighted = _robust(jacobian, errors - jacobian @ motion)
+            stated_scale, stated = scale, weighted = _robust(jacobian, errors)
+            for _ in range(7):  # to the motion without which the errors are those of the matches alone
                 motion = np.linalg.solve(weighted.T @ jacobian + 100 * np.eye(6), weighted.T @ errors)
-            stated_scale, stated_weighted = _robust(jacobian, errors)
+                scale, weighted = _robust(jacobian, errors - jacobian @ motion)
             if stated_scale < SAME_SCALE * scale:  # the motion serves a minority, such as windows matched to others
-                weighted = stated_weighted
+                weighted = stated
             share = min(1.0, INDEPENDENT / len(errors))
             parts.append((share * weighted.T @ jacobian, share * weighted.T @ errors))
         return parts
