@@ -45,6 +45,7 @@ from toolkit.pose.intrinsics_check import MAX_SHARES, SIGNIFICANCE
 from toolkit.pose.pnp import PNP_FORMAT
 from toolkit.pose.result import QueryResult, status_counts
 from toolkit.prediction.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
+from toolkit.prediction.lifting import lifts
 from toolkit.prediction.network import open_predictor
 from toolkit.results.metrics import camera_messages
 from toolkit.results.opening import MAPS, attributes, session_fingerprint, update_attributes
@@ -319,8 +320,9 @@ class _Pair:
             record |= {
                 "predictor": {"name": stage.predictor.name} | stage.predictor.settings,
                 "references": settings.predictor.num_references,
-                "depths": map_session.depths_fingerprint,
             }
+        if stage.predictor is not None or lifts(settings, map_session):
+            record["depths"] = map_session.depths_fingerprint
         return record
 
     def update(self) -> bool:

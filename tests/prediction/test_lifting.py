@@ -16,6 +16,7 @@ from tests.queries import session_query
 from tests.rendered import copy_shared
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
+from toolkit.capture.depths import lifted
 from toolkit.capture.names import ALLOW_OUTSIDE, allow_outside
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import SceneFiles, write_text
@@ -123,7 +124,7 @@ def test_depth_maps_localize_where_nothing_is_triangulated(world: World, index: 
 @pytest.mark.parametrize("index", range(4))
 def test_predicted_depth_localizes_without_depth_maps(world: World, index: int) -> None:
     feed_forward, answer = world.answer(index, world.predictor, world.without_depth)
-    found = DepthLifter(world.pnp, feed_forward).localize(*world.queries[index], answer)
+    found = DepthLifter(world.pnp, feed_forward.seen_depth).localize(*world.queries[index], answer)
     assert found is not None
     assert found.found_by == "lifted+feed_forward"
     rotation_deg, distance_m = world.error(index, found)
@@ -164,7 +165,7 @@ class WrongDepth:
 def test_wrong_depth_is_never_a_wrong_pose_called_ok(world: World, how: str) -> None:
     for index in range(3):
         feed_forward, answer = world.answer(index, WrongDepth(world.predictor, how), world.without_depth)
-        lifted = DepthLifter(world.pnp, feed_forward).localize(*world.queries[index], answer)
+        lifted = DepthLifter(world.pnp, feed_forward.seen_depth).localize(*world.queries[index], answer)
         assert lifted is not None
         found = world.localize(index, WrongDepth(world.predictor, how), world.without_depth)
         for estimate in (lifted, found):
@@ -180,7 +181,7 @@ def test_a_wrong_scale_of_one_image_is_in_the_covariance(world: World) -> None:
     query, (references,) = world.queries[0]
     place = world.true[0, :3, 3]
     far = max(references.images[:5], key=lambda image: np.linalg.norm(world.map.world_from_cams[image, :3, 3] - place))
-    found = DepthLifter(world.pnp, feed_forward).localize(query, [References.of([far])], answer)
+    found = DepthLifter(world.pnp, feed_forward.seen_depth).localize(query, [References.of([far])], answer)
     assert found is not None
     if found.world_from_rig is not None:
         arm = np.linalg.norm(world.map.world_from_cams[far, :3, 3] - found.world_from_rig[:3, 3])
@@ -191,47 +192,51 @@ def test_without_depth_nothing_is_lifted(world: World) -> None:
     feed_forward, _ = world.answer(0, world.predictor, world.without_depth)
     nothing = FeedForwardAnswer(QueryResult.failed("no references"))
     query, references = world.queries[0]
-    assert DepthLifter(world.pnp, feed_forward).localize(query, references, nothing) is None
+    assert DepthLifter(world.pnp, feed_forward.seen_depth).localize(query, references, nothing) is None
     untold = QueryPrediction((np.zeros(0, np.int64),) * len(query.views), ("no references",) * len(query.views))
     found = HybridLocalizer(world.pnp, feed_forward).localize(query, references, untold)
     assert found.status_text == "failed: too few matches"
 
 
-def test_a_map_of_one_photograph_localizes_what_looks_like_it(
-    small_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("method", ["pnp", "hybrid"])
+def test_a_map_of_one_photograph_localizes_by_its_depth_map(
+    small_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
 ) -> None:
     """Nothing can be triangulated; the rows say what the pose rests on."""
     monkeypatch.setenv(ALLOW_OUTSIDE, "1")
+    capture = Capture.open(small_capture)
+    query, all_images = capture["ios_query"], capture["ios_map"]
+    true = query.world_from_cam(ground_truth=True)
+    rotation_deg, distance_m = geometry.pose_error(all_images.world_from_cam(), true[:1])
+    nearest = int(np.argmin(rotation_deg / 20 + distance_m))
     root = tmp_path / small_capture.name
     shutil.copytree(small_capture / "sessions" / "ios_query", root / "sessions" / "ios_query", symlinks=True)
     mapped = root / "sessions" / "ios_map"
     mapped.mkdir(parents=True)
     for path in (small_capture / "sessions" / "ios_map").iterdir():
-        if path.name != "images.txt":
+        if path.name not in ("images.txt", "depths.txt"):
             (mapped / path.name).symlink_to(path)
     lines = (small_capture / "sessions" / "ios_map" / "images.txt").read_text().splitlines()
-    capture = Capture.open(small_capture)
-    query = capture["ios_query"]
-    true = query.world_from_cam(ground_truth=True)
-    rotation_deg, distance_m = geometry.pose_error(capture["ios_map"].world_from_cam(), true[:1])
-    nearest = int(np.argmin(rotation_deg / 20 + distance_m))
     (mapped / "images.txt").write_text(f"{lines[0]}\n{lines[1 + nearest]}\n")
+    shutil.copy(small_capture / "sessions" / "ios_map" / "depths.txt", mapped)
     files = SceneFiles(tmp_path / "run", root.name)
-    name = capture["ios_map"].image_name(nearest)
-    rows = [
-        {"timestamp": str(image.timestamp), "sensor_id": image.sensor_id,
-         "topk": [{"path": f"{root.name}/sessions/{name}", "score": 1.0}]}
-        for image in query.images.itertuples()
-    ]  # fmt: skip
+    topk = [{"path": f"{root.name}/sessions/{all_images.image_name(nearest)}", "score": 1.0}]
+    rows = [{"timestamp": str(image.timestamp), "sensor_id": image.sensor_id, "topk": topk}
+            for image in query.images.itertuples()]  # fmt: skip
     write_text(files.retrieval("ios", "ios"), "".join(json.dumps(row) + "\n" for row in rows))
     folders = (files.retrieval_dir, files.poses_dir, files.features, files.maps)
     options = {"map_device": "ios", "query_device": "ios", "queries": "keyframes_original", "workers": 1}
-    call(localize_pairs, root / "sessions", *folders, method="hybrid", predictor="simulated", **options)  # type: ignore[arg-type]
-    table = pd.read_csv(files.poses_csv("ios", "ios"))
+    options |= {"method": method, "predictor": "simulated", "features": ["sift"]}
+
+    def localize() -> pd.DataFrame:
+        call(localize_pairs, root / "sessions", *folders, **options)  # type: ignore[arg-type]
+        return pd.read_csv(files.poses_csv("ios", "ios"))
+
+    table = localize()
     poses = Trajectory.read(files.poses_txt("ios", "ios"))
     key = table["timestamp"] == int(query.images["timestamp"].iloc[0])
     assert table.loc[key, "status"].item() == "ok"
-    assert table.loc[key, "method"].item() == "hybrid:simulated/lifted"
+    assert table.loc[key, "method"].item() == {"pnp": "lifted", "hybrid": "hybrid:simulated/lifted"}[method]
     found = poses.lookup([int(query.images["timestamp"].iloc[0])], [query.device_ids[0]])[0]
     degrees, meters = geometry.pose_error(found, true[0])
     assert degrees < 0.3
@@ -241,3 +246,32 @@ def test_a_map_of_one_photograph_localizes_what_looks_like_it(
     degrees, meters = geometry.pose_error(poses.lookup(ok["timestamp"], ok["device_id"]), right)
     assert (degrees < 1).all()
     assert (meters < 0.1).all()
+    if method == "pnp":  # poses follow from the depth maps
+        (mapped / "depths.txt").unlink()
+        table = localize()
+        assert set(table["status"].str.partition(":")[0]) == {"failed"}
+
+
+def test_depth_maps_in_another_unit_are_not_used(world: World, caplog: pytest.LogCaptureFixture) -> None:
+    """Triangulated points tell."""
+    seen = FeedForwardLocalizer(world.map, world.map_session, world.predictor).seen_depth
+    image = int(world.queries[0][1][0].images[0])
+    features = world.pnp.matcher.mapped[0].features
+    keypoints = features[world.map.image_names[image]].keypoints.astype(np.float64)
+    depth_m = seen(image).at(keypoints)
+    few = np.flatnonzero(np.isfinite(depth_m))[:20]
+    in_cam = lifted(world.map.cameras[image], keypoints[few], depth_m[few])
+    numbers = np.arange(len(few))
+    known = replace(
+        world.map, points=geometry.transform(world.map.world_from_cams[image], in_cam),
+        colors=np.zeros((len(few), 3), np.uint8), obs_image=np.full(len(few), image), obs_keypoint=few,
+        obs_point=numbers, noise_px=np.ones(len(few), np.float32),
+    )  # fmt: skip
+    pnp = PnpLocalizer([MappedFeatures(known, features)])
+    assert DepthLifter(pnp, seen).lift([image]) is not None
+    assert not caplog.records
+    tum = DepthLifter(pnp, lambda index: replace(seen(index), depth_m=5 * seen(index).depth_m))
+    assert tum.lift([image]) is None
+    assert tum.lift([image]) is None
+    (told,) = caplog.records
+    assert f"{world.map.image_names[image]}: its depth map is not used: 5 of the depth" in told.getMessage()

@@ -20,7 +20,7 @@ from toolkit.pose.base import NetworkMatches, References
 from toolkit.pose.rig import Matches, RigQuery
 
 MAX_MAP_FEATURES = 1000
-"""Largest number of features per map image to match; those of the points with the longest tracks are used."""
+"""Largest number of features per map image to match."""
 MAX_QUERY_FEATURES = 1536
 """Largest number of features per query image to match by descriptors alone; those with the strongest response are used.
 Guided matching uses all features."""
@@ -58,6 +58,7 @@ class MappedFeatures:
         name: str = "sift",
         matcher: Matcher | None = None,
         kind: FeatureKind | None = None,
+        most: int = MAX_MAP_FEATURES,
     ):
         """
         Args:
@@ -66,17 +67,18 @@ class MappedFeatures:
             name: of the kind of features.
             matcher: None: `mutual` with the limits of the kind. Any `mutual` compares descriptors as the kind says.
             kind: None: that of the name in `KINDS`.
+            most: features of a map image to match, at most; those of the points with the longest tracks are used.
         """
-        self.map, self.features, self.name = local_map, features, name
+        self.map, self.features, self.name, self.most = local_map, features, name, most
         self.kind = kind or KINDS[name]
         self.matcher = matcher or MutualMatcher.of(self.kind)
         self.image = lru_cache(CACHED_IMAGES)(self._image)
         """Cached `_image`."""
         self._network = Lock()
 
-    def with_map(self, local_map: LocalMap) -> "MappedFeatures":
+    def with_map(self, local_map: LocalMap, most: int = MAX_MAP_FEATURES) -> "MappedFeatures":
         """Return the same features with another map of their images."""
-        return MappedFeatures(local_map, self.features, self.name, self.matcher, self.kind)
+        return MappedFeatures(local_map, self.features, self.name, self.matcher, self.kind, most)
 
     def match(
         self,
@@ -117,9 +119,9 @@ class MappedFeatures:
         return matches
 
     def _image(self, index: int) -> MapImage:
-        """Return the features of a map image that observe points, at most `MAX_MAP_FEATURES`, longest tracks first."""
+        """Return the features of a map image that observe points, at most `most`, longest tracks first."""
         keypoint, point = self.map.observations(index)
-        order = np.argsort(-self.map.track_lengths(point), kind="stable")[:MAX_MAP_FEATURES]
+        order = np.argsort(-self.map.track_lengths(point), kind="stable")[: self.most]
         features = self.features[self.map.image_names[index]]
         kept = features.take(keypoint[order])
         unit = unit_descriptors(kept.descriptors, self.kind.shorten)

@@ -1,6 +1,6 @@
 """Localize without matching: align a network's predicted cameras of the query and its references to the map."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -103,8 +103,7 @@ class FeedForwardLocalizer(Localizer):
         self.predictor = predictor
         self.settings = settings or PredictorSettings()
         self._session = session
-        self._depths = DepthMaps(session)
-        self._length = length
+        self.seen_depth = depth_of_images(session, local_map.image_names, length)
         self._upright = turns is not None
         self._turns = np.zeros(len(session.images), np.int64) if turns is None else turns.of(session)
         self._next: tuple[Sequence[QueryInput], _Groups] = (), ([], {})
@@ -256,10 +255,19 @@ class FeedForwardLocalizer(Localizer):
         in_cam = lifted(self.map.cameras[image], seen.pixels[sample], seen.depth_m[sample])
         return geometry.transform(self.map.world_from_cams[image], in_cam)
 
-    def seen_depth(self, image: int) -> SeenDepth:
-        """Return the depth of a map image from the capture's depth maps, in the unit of the local map."""
-        seen = self._depths.of(self._session.row_of_name[self.map.image_names[image]])
-        return replace(seen, depth_m=seen.depth_m / self._length)
+
+def depth_of_images(session: Session, names: Sequence[str], length: float = 1.0) -> Callable[[int], SeenDepth]:
+    """Return a function that returns the depth of a map image, by its index in `names`, from the session's depth maps.
+
+    Depth is divided by `length`, see `Survey.length`.
+    """
+    depths = DepthMaps(session)
+
+    def of_image(image: int) -> SeenDepth:
+        seen = depths.of(session.row_of_name[names[image]])
+        return replace(seen, depth_m=seen.depth_m / length)
+
+    return of_image
 
 
 def _combine(query: Query, cameras: tuple[CameraAnswer, ...], image_names: Sequence[str]) -> QueryResult:

@@ -21,7 +21,7 @@ class HybridLocalizer(Localizer):
     def __init__(self, pnp: PnpLocalizer, feed_forward: FeedForwardLocalizer):
         self.pnp = pnp
         self.feed_forward = feed_forward
-        self.lifter = DepthLifter(pnp, feed_forward)
+        self.lifter = DepthLifter(pnp, feed_forward.seen_depth)
         self.image_names, self.batch_size = pnp.image_names, feed_forward.batch_size
         self._index_of = {name: index for index, name in enumerate(self.image_names)}
 

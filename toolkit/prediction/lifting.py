@@ -5,7 +5,8 @@ depth of an image scales its points about its camera and moves the query toward 
 matches are with one image, no reprojection error shows this. So the covariance treats that scale as an unknown.
 """
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,23 +14,27 @@ import numpy as np
 from toolkit import geometry
 from toolkit.alignment.depth_scale import DEPTH_NOISE
 from toolkit.alignment.robust import Bools
-from toolkit.capture.depths import lifted
+from toolkit.capture import Session
+from toolkit.capture.depths import SeenDepth, lifted
 from toolkit.geometry import Floats, Ints
-from toolkit.manifest import PnpSettings
+from toolkit.manifest import LocalizeSettings, PnpSettings
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.base import Prior, Query, References
-from toolkit.pose.map_matching import MappedFeatures
-from toolkit.pose.pnp import GUIDED_WEIGHT, PnpLocalizer
+from toolkit.pose.base import Localizer, Prior, Query, References
+from toolkit.pose.map_matching import MAX_MAP_FEATURES, MappedFeatures
+from toolkit.pose.pnp import GUIDED_WEIGHT, PnpLocalizer, PnpMatches
 from toolkit.pose.result import QueryResult, Status
 from toolkit.pose.rig import Matches, RigQuery, least_squares_covariance
-from toolkit.prediction.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer
+from toolkit.prediction.feed_forward import CameraAnswer, FeedForwardAnswer
 from toolkit.threads import fixed_sums
+
+log = logging.getLogger(__name__)
 
 DEPTH_MAP_STD = 0.01  # relative standard deviation of the scale of a depth map
 LEAST_LIFTED = 20  # features of a map image with depth from its depth maps; with fewer, predicted depth is used
 LEAST_RATIOS = 10  # fewest depth ratios that give the predicted depth of an image its own scale
 MOST_RATIOS = 10  # most ratios that count as independent, as the depth errors of networks are spatially correlated
 MAX_RATIO_SPREAD = 0.25  # relative spread of the ratios of an image above which its predicted depth is wrong
+MOST_FEATURES = 4096  # of a map image, for depth maps alone: with fewer, those of triangulated points hide the others
 CONTRADICTION = 3.0  # standard deviations per axis above which a pose contradicts the predicted camera
 
 
@@ -63,13 +68,21 @@ class LiftedMap:
 class DepthLifter:
     """Lifts features of map images, of the first kind that `pnp` has, and localizes with them. Thread-safe."""
 
-    def __init__(self, pnp: PnpLocalizer, feed_forward: FeedForwardLocalizer) -> None:
-        self._first, self._pnp, self._feed_forward = pnp.matcher.mapped[0], pnp, feed_forward
+    def __init__(self, pnp: PnpLocalizer, seen_depth: Callable[[int], SeenDepth], most: int = MAX_MAP_FEATURES) -> None:
+        """
+        Args:
+            pnp: localizes with the triangulated points.
+            seen_depth: returns the depth of a map image from the capture's depth maps, see `depth_of_images`.
+            most: see `MappedFeatures`.
+        """
+        self._first, self._pnp, self._seen_depth, self._most = pnp.matcher.mapped[0], pnp, seen_depth, most
+        self._warned = False
 
     @fixed_sums
     def localize(
-        self, query: Query, references: Sequence[References], answer: FeedForwardAnswer, priors: Sequence[Prior] = ()
-    ) -> QueryResult | None:
+        self, query: Query, references: Sequence[References], answer: FeedForwardAnswer | None = None,
+        priors: Sequence[Prior] = (),
+    ) -> QueryResult | None:  # fmt: skip
         """Return a pose from triangulated and lifted features of the references; None if none can be lifted.
 
         The pose is `ok` by the rules of `PnpLocalizer`. Its covariance includes the unknown depth scale of each image.
@@ -77,7 +90,7 @@ class DepthLifter:
 
         Args:
             query, references, priors: as for `PnpLocalizer.localize`.
-            answer: result of `FeedForwardLocalizer.answer` for the query.
+            answer: result of `FeedForwardLocalizer.answer` for the query; None: only depth maps give depth.
         """
         count = len(self._first.map.image_names)  # larger indices are images of other kinds of features
         references = [retrieved.take(retrieved.images < count) for retrieved in references]
@@ -90,7 +103,8 @@ class DepthLifter:
         lifted_map = self.lift(images, answer)
         if lifted_map is None:
             return None
-        localizer = _LiftedLocalizer(lifted_map, self._first, self._pnp.settings, self._pnp.seed)
+        mapped = self._first.with_map(lifted_map.local_map, self._most)
+        localizer = _LiftedLocalizer(lifted_map, mapped, self._pnp.settings, self._pnp.seed)
         estimate = localizer.localize(query, references, None, priors)
         matched = estimate.correspondences
         source = lifted_map.image[matched.point_index]
@@ -106,18 +120,18 @@ class DepthLifter:
             correspondences=replace(matched, point_index=whole_index[matched.point_index], found_by=found_by),
         )
         unmeasured = any(not depth.measured for depth in used)
-        if estimate.status is Status.OK and unmeasured and not _consistent(estimate, answer.estimate):
+        if unmeasured and answer and estimate.status is Status.OK and not _consistent(estimate, answer.estimate):
             why = "the predicted camera contradicts the pose that its depth gives"
             return replace(estimate, status=Status.LOW_CONFIDENCE, remark=why)
         return estimate
 
-    def lift(self, images: Sequence[int], answer: FeedForwardAnswer) -> LiftedMap | None:
+    def lift(self, images: Sequence[int], answer: FeedForwardAnswer | None = None) -> LiftedMap | None:
         """Return the part of the map that images observe, with lifted points for features without triangulated ones.
 
         Returns None if no feature has depth.
         """
         local_map = self._first.map
-        predictions = _predictions(answer)
+        predictions = {} if answer is None else _predictions(answer)
         points, keypoints, source, depths = [], [], [], {}
         for image in images:
             xy = self._first.features[local_map.image_names[image]].keypoints.astype(np.float64)
@@ -151,11 +165,26 @@ class DepthLifter:
         )
         return LiftedMap(part, triangulated, np.concatenate([np.full(len(triangulated), -1), lifted_from]), depths)
 
+    def _fits(self, image: int, seen: SeenDepth) -> bool:
+        """Tell whether depth maps agree with the triangulated points of an image, if it has enough of them."""
+        local_map = self._first.map
+        keypoints, points = local_map.observations(image)
+        depth_m = seen.at(self._first.features[local_map.image_names[image]].keypoints[keypoints])
+        ratios = depth_m / geometry.transform(local_map.cams_from_world[image], local_map.points[points])[:, 2]
+        ratios = ratios[ratios > 0]
+        if len(ratios) < LEAST_RATIOS or abs(np.log(middle := float(np.median(ratios)))) <= MAX_RATIO_SPREAD:
+            return True
+        if not self._warned:
+            self._warned = True
+            found = f"its depth map is not used: {middle:.3g} of the depth of its map points, in the median"
+            log.warning("%s: %s", local_map.image_names[image], found)
+        return False
+
     def _depth(self, image: int, xy: Floats, predicted: tuple[CameraAnswer, int] | None) -> Depth | None:
         """Return the depth at pixels of a map image from the capture's depth maps, else the predicted depth."""
-        seen = self._feed_forward.seen_depth(image)
+        seen = self._seen_depth(image)
         depth_m = seen.at(xy)
-        if np.isfinite(depth_m).sum() >= LEAST_LIFTED:
+        if np.isfinite(depth_m).sum() >= LEAST_LIFTED and self._fits(image, seen):
             return Depth(depth_m, DEPTH_MAP_STD)
         if predicted is None:
             return None
@@ -179,11 +208,39 @@ class DepthLifter:
         return Depth(scale * answer.prediction.depth_at(view, xy), max(std, DEPTH_MAP_STD), True, measured)
 
 
+def lifts(settings: LocalizeSettings, map_session: Session) -> bool:
+    """Tell whether `pnp` lifts features of a map: it has depth maps, which are in meters, as its poses are."""
+    return settings.method == "pnp" and settings.unit is not None and map_session.depths is not None
+
+
+class LiftingLocalizer(Localizer):
+    """A `PnpLocalizer` that lifts map features by depth maps for queries that have no pose without them.
+
+    Other poses stay: features of many map images tell a pose better than the depth of a few.
+    """
+
+    def __init__(self, pnp: PnpLocalizer, seen_depth: Callable[[int], SeenDepth]) -> None:
+        self._pnp, self._lifter = pnp, DepthLifter(pnp, seen_depth, MOST_FEATURES)
+        self.image_names = pnp.image_names
+
+    def match(self, query: Query, references: Sequence[References]) -> PnpMatches:
+        """Return the matches of a query with its references; see `Localizer`."""
+        return self._pnp.match(query, references)
+
+    def solve(self, matches: PnpMatches, prediction: None = None, priors: Sequence[Prior] = ()) -> QueryResult:
+        """Return the pose from matches with triangulated points, else the one with lifted points; see `Localizer`."""
+        matched = self._pnp.solve(matches, None, priors)
+        if matched.world_from_rig is not None or not matches.usable:
+            return matched
+        lifted = self._lifter.localize(matches.query, matches.references, None, priors)
+        return matched if lifted is None or lifted.world_from_rig is None else lifted
+
+
 class _LiftedLocalizer(PnpLocalizer):
     """Localizes in a lifted map. Its covariance includes the uncertain depth scale of each lifted image."""
 
     def __init__(self, lifted_map: LiftedMap, mapped: MappedFeatures, settings: PnpSettings, seed: int) -> None:
-        super().__init__([mapped.with_map(lifted_map.local_map)], settings, seed)
+        super().__init__([mapped], settings, seed)
         self._lifted_map = lifted_map
 
     def _covariance(

@@ -53,9 +53,10 @@ from toolkit.pose.local_triangulation import OnDemandLocalizer, PosedImages
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer
 from toolkit.pose.result import CAMERA, QueryResult, Status
-from toolkit.prediction.feed_forward import FeedForwardLocalizer
+from toolkit.prediction.feed_forward import FeedForwardLocalizer, depth_of_images
 from toolkit.prediction.hybrid import HybridLocalizer
 from toolkit.prediction.interface import Predictor
+from toolkit.prediction.lifting import LiftingLocalizer, lifts
 from toolkit.prediction.network import open_predictor
 from toolkit.results.metrics import is_posed, length_unit
 from toolkit.results.opening import (
@@ -497,7 +498,8 @@ class Map:
             )
         pnp = PnpLocalizer(self.in_lengths, settings.pnp, settings.seed)
         if not settings.predicts:
-            return pnp
+            of_image = depth_of_images(self.session, pnp.image_names, self.length)
+            return LiftingLocalizer(pnp, of_image) if lifts(settings, self.session) else pnp
         predictor = self.predictor or open_predictor(settings, self.capture, self.map_dir)
         feed_forward = FeedForwardLocalizer(
             self.in_lengths[0].map, self.session, predictor, settings.predictor, self.turns, self.length
