@@ -407,6 +407,7 @@ def _shared(
     timestamps_unit: Annotated[str | None, Option(metavar="s|ms|us|ns", help="Of times that are given.")] = None,
     odometry: Annotated[Path | None, Option(help="The queries' own poses: TUM, EuRoC, KITTI, ARKit.")] = None,
     depth: Annotated[Path | None, Option(metavar="DIR", help="Depth maps: PNG, 16 bits, millimeters.")] = None,
+    depth_unit_mm: Annotated[float, Option("--depth-unit", metavar="MM", help="Millimeters per unit; TUM: 0.2.")] = 1.0,
     depth_camera: Annotated[str | None, Option(metavar="'MODEL, W, H, ...'", help="If it is not the image's.")] = None,
     fixes: Annotated[str | None, Option(metavar="exif|FILE", help=_FIXES)] = None,
     replace: Replace = False,

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from toolkit.__main__ import app
 from toolkit.capture import Capture
 from toolkit.capture.check import check_capture
+from toolkit.capture.depths import DepthMaps
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.datasets import LAYOUTS, import_dataset
 from toolkit.geometry import Floats, invert, make_pose, qt_from_pose, quaternion_to_rotation
@@ -32,6 +33,11 @@ def photograph(path: Path, size: tuple[int, int] = (64, 48)) -> Path:
     return path
 
 
+def two_meters(path: Path, units_per_m: int = 1000) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    PIL.Image.fromarray(np.full((480, 640), 2 * units_per_m, np.uint16)).save(path)
+
+
 def text(path: Path, *lines: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("\n".join(lines) + "\n")
@@ -47,7 +53,7 @@ def seven_scenes(root: Path) -> Poses:
         photograph(scene / f"{name}.color.png", (640, 480))
         poses[f"{name}.color.png"] = pose(number)
         text(scene / f"{name}.pose.txt", *map(words, pose(number)))
-        PIL.Image.fromarray(np.full((480, 640), 65535, np.uint16)).save(scene / f"{name}.depth.png")
+        two_meters(scene / f"{name}.depth.png")
     photograph(scene / "seq-03" / "frame-000001.color.png", (640, 480))
     text(scene / "seq-03" / "frame-000001.pose.txt", *["nan nan nan nan"] * 4)
     text(scene / "TrainSplit.txt", "sequence1")
@@ -62,8 +68,11 @@ def twelve_scenes(root: Path) -> Poses:
         photograph(scene / f"{name}.color.jpg", (1296, 968))
         poses[f"{name}.color.jpg"] = pose(number)
         text(scene / f"{name}.pose.txt", *map(words, pose(number)))
+        two_meters(scene / f"{name}.depth.png")
     text(scene / "split.txt", "sequence0 [frames=1]  [start=0 ; end=0]", "sequence1 [frames=2]  [start=1 ; end=2]")
-    text(scene / "info.txt", "m_colorWidth = 1296", "m_calibrationColorIntrinsic = 1170.1 0 647.7 0 0 1170.2 483.7 0")
+    color, depth = "1170.1 0 647.7 0 0 1170.2 483.7 0", "572 0 320 0 0 572 240 0"
+    lines = [f"m_calibrationColorIntrinsic = {color}", f"m_calibrationDepthIntrinsic = {depth}"]
+    text(scene / "info.txt", "m_colorWidth = 1296", *lines)
     return poses
 
 
@@ -112,6 +121,7 @@ def tum(root: Path) -> Poses:
     for number in range(4):
         time, name = 1305031102.175304 + number / 30, f"rgb/{number}.png"
         photograph(scene / name, (640, 480))
+        two_meters(scene / "depth" / f"{time + 0.012:.6f}.png", units_per_m=5000)
         images.append(f"{time:.6f} {name}")
         if number < 3:
             poses[name] = pose(number)
@@ -192,6 +202,22 @@ def test_a_data_set_becomes_a_capture_with_its_poses_and_thresholds(
     assert manifest["evaluate"]["thresholds"] == [list(limit) for limit in LAYOUTS[kind].thresholds]
     assert CliRunner().invoke(app, command).exit_code == 1
     assert CliRunner().invoke(app, [*command, "--replace"]).exit_code == 0
+
+
+@pytest.mark.parametrize("kind", ["7scenes", "12scenes", "tum"])
+def test_depth_maps_of_data_sets_are_in_meters_and_in_their_own_camera(kind: str, tmp_path: Path) -> None:
+    write, scene, _ = WRITERS[kind]
+    write(tmp_path / kind)
+    report = import_dataset(kind, tmp_path / kind, tmp_path / "PLACE", scene, hold_out=2)
+    assert report.record["depth maps"][0] == len(report.images[report.images["status"] == "imported"])
+    assert check_capture(tmp_path / "PLACE", deep=True).ok
+    for name in ("ios_map", "ios_query"):
+        session = Capture.open(tmp_path / "PLACE")[name]
+        seen = DepthMaps(session).of(0)
+        assert len(seen) > 1000, seen.reason
+        np.testing.assert_allclose(seen.depth_m, 2, rtol=1e-6)
+        # The depth camera of 7-Scenes sees less than that for color, by 525 / 585 of the half width.
+        assert (seen.pixels[:, 0].min() > 30) == (kind == "7scenes")
 
 
 def test_images_without_a_pose_are_rows(tmp_path: Path) -> None:

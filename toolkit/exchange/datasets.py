@@ -29,6 +29,7 @@ from toolkit.manifest import nearest
 HOLD_OUT = 8
 """Every such photograph becomes a query, in data sets without a split."""
 _SEVEN_SCENES = (525.0, 525.0, 320.0, 240.0)  # of the color camera, as usual for this data set; none is published
+_DEPTH_585 = "PINHOLE, 640, 480, 585, 585, 320, 240"  # of 7-Scenes' depth camera, from the data set's page
 _TWELVE_SCENES = (572.0, 572.0, 320.0, 240.0)  # at 640 x 480, where a scene has no info.txt
 _TUM = {
     "freiburg1": "FULL_OPENCV, 640, 480, 517.3, 516.5, 318.6, 255.3, .2624, -.9531, -.0054, .0026, 1.1633, 0, 0, 0",
@@ -54,6 +55,8 @@ class Layout(NamedTuple):
     read: Callable[[Path], tuple[Path, list[Photograph]]]  # from a scene's folder: the folder of its images, and these
     thresholds: Sequence[tuple[float, float]]  # of recall, as usual for the data set: degrees, meters
     example: str  # a file that tells a scene's folder
+    depth: Callable[[Path], dict[str, Any]] = lambda _: {}
+    """Returns the `drafts.Options` that tell where in a scene's folder depth maps are, and their camera and unit."""
 
 
 def import_dataset(
@@ -88,6 +91,8 @@ def import_dataset(
         raise CaptureError.at(folder, found, "a scene in the layout in which it is published", do)
     root, images = layout.read(folder)
     options["unit_m"], options["hold_out"] = 1.0, options.get("hold_out") or HOLD_OUT
+    if options.get("depth") is None:
+        options |= layout.depth(folder)
     draft = start(capture, device, "map", root, **options)
     draft.record["meters"] = f"the files of {kind}"
     numbers, taken = Counter[str](), list[Photograph]()
@@ -176,11 +181,7 @@ def _twelve_scenes(folder: Path) -> tuple[Path, list[Photograph]]:
     size = _size(first)
     if isinstance(size, str):
         raise CaptureError(f"{first}: {size}.")
-    fx, fy, cx, cy = np.array(_TWELVE_SCENES) * size[0] / 640
-    for where, words in lines_of(folder / "info.txt") if (folder / "info.txt").is_file() else ():
-        if words[0] == "m_calibrationColorIntrinsic":
-            fx, _, cx, _, _, fy, cy = numbers_of(where, words[2:], 7)
-    camera = camera_at(folder / "info.txt", f"PINHOLE, {size[0]}, {size[1]}, {fx}, {fy}, {cx}, {cy}")
+    camera = camera_at(folder / "info.txt", _twelve_scenes_camera(folder, "Color", size))
     # The first sequence is for tests: `sequence0 [frames=357]  [start=0 ; end=356]`.
     ranges = [words for _, words in lines_of(folder / "split.txt") if words[0].startswith("sequence")]
     found = re.search(r"start\s*=\s*(\d+).*?end\s*=\s*(\d+)", " ".join(ranges[0])) if ranges else None
@@ -192,6 +193,30 @@ def _twelve_scenes(folder: Path) -> tuple[Path, list[Photograph]]:
         name = path.relative_to(folder).as_posix()
         images.append(Photograph(name, split, camera, _matrix(_beside(path, "pose.txt"))))
     return folder, images
+
+
+def _twelve_scenes_camera(folder: Path, which: str, size: tuple[int, int]) -> str:
+    fx, fy, cx, cy = np.array(_TWELVE_SCENES) * size[0] / 640
+    for where, words in lines_of(folder / "info.txt") if (folder / "info.txt").is_file() else ():
+        if words[0] == f"m_calibration{which}Intrinsic":
+            fx, _, cx, _, _, fy, cy = numbers_of(where, words[2:], 7)
+    return f"PINHOLE, {size[0]}, {size[1]}, {fx}, {fy}, {cx}, {cy}"
+
+
+def _depth_of_twelve_scenes(folder: Path) -> dict[str, Any]:
+    first = next((folder / "data").glob("*.depth.png"), None)
+    size = None if first is None else _size(first)
+    if not isinstance(size, tuple):
+        return {}
+    return {"depth": folder, "depth_camera": _twelve_scenes_camera(folder, "Depth", size)}
+
+
+def _depth_of_tum(folder: Path) -> dict[str, Any]:
+    return {"depth": folder / "depth", "depth_unit_mm": 0.2} if any(folder.glob("depth/*.png")) else {}
+
+
+def _depth_of_seven_scenes(folder: Path) -> dict[str, Any]:
+    return {"depth": folder, "depth_camera": _DEPTH_585} if any(folder.glob("seq-*/*.depth.png")) else {}
 
 
 def _cambridge(folder: Path) -> tuple[Path, list[Photograph]]:
@@ -315,12 +340,12 @@ def _euroc(folder: Path) -> tuple[Path, list[Photograph]]:
 
 
 LAYOUTS = {
-    "7scenes": Layout(_seven_scenes, [(5.0, 0.05)], "TrainSplit.txt"),
-    "12scenes": Layout(_twelve_scenes, [(5.0, 0.05)], "split.txt"),
+    "7scenes": Layout(_seven_scenes, [(5.0, 0.05)], "TrainSplit.txt", _depth_of_seven_scenes),
+    "12scenes": Layout(_twelve_scenes, [(5.0, 0.05)], "split.txt", _depth_of_twelve_scenes),
     "cambridge": Layout(_cambridge, [(5.0, 0.25), (5.0, 0.5)], "dataset_train.txt"),
     "aachen": Layout(_aachen, [(2.0, 0.25), (5.0, 0.5), (10.0, 5.0)], "3D-models"),
     "eth3d": Layout(_eth3d, [(1.0, 0.05), (5.0, 0.25)], "dslr_calibration_undistorted"),
-    "tum": Layout(_tum, [(1.0, 0.05), (5.0, 0.25)], "groundtruth.txt"),
+    "tum": Layout(_tum, [(1.0, 0.05), (5.0, 0.25)], "groundtruth.txt", _depth_of_tum),
     "kitti": Layout(_kitti, [(1.0, 0.25), (2.0, 0.5)], "calib.txt"),
     "euroc": Layout(_euroc, [(1.0, 0.1), (5.0, 0.5)], "mav0"),
 }

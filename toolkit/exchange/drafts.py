@@ -42,6 +42,7 @@ from toolkit.capture.images import (
 from toolkit.capture.names import EXPECTED_NAME, has_long_part, is_bad_name, is_linked_here, note_linked_here
 from toolkit.capture.tables import COLUMNS, write_table
 from toolkit.capture.world_up import up_of_cameras
+from toolkit.capture.writing import read_depth, write_depth
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.georeference import alignment, gps_position, quarter_turns, read_positions
 from toolkit.exchange.import_report import ImportReport, cameras_of, grouped
@@ -121,7 +122,9 @@ class Options:
     odometry: str | Path | None = None
     """The device's own poses, for the queries: a list as of `recordings.read_track`, with `axes` and `unit_m`."""
     depth: str | Path | None = None
-    """Folder of depth maps, see `recordings.find_depths`: PNG, 16 bits, millimeters, 0 and 65535 where unknown."""
+    """Folder of depth maps, see `recordings.find_depths`: PNG, 16 bits, 0 and 65535 where unknown."""
+    depth_unit_mm: float = 1.0
+    """Millimeters per unit of these; TUM: 0.2."""
     depth_camera: str | None = None
     """Intrinsics of the depth maps, `MODEL, width, height, parameter, ...`, if they are not those of the images."""
     fixes: str | Path | None = None
@@ -501,6 +504,8 @@ class Draft(Options):
                 target.parent.mkdir(parents=True, exist_ok=True)
                 if source.name.lower().endswith(HEIC_SUFFIXES):
                     write_png(source, target)
+                elif source in depths and self.depth_unit_mm != 1:
+                    write_depth(target, self.depth_unit_mm * read_depth(source))
                 elif self.placing == "copy":
                     shutil.copyfile(source, target)
                 else:
@@ -690,6 +695,8 @@ def start(capture: str | Path, device: str, split: str, folder: Path, **options:
         raise ManifestError(f"axes: unknown {draft.axes!r}. {nearest(draft.axes, AXES)}")
     if draft.unit_m is not None and not 0 < draft.unit_m < np.inf:
         raise ManifestError(f"unit: found {draft.unit_m:g}, expected the meters per unit of the poses, such as 0.01.")
+    if not 0 < draft.depth_unit_mm < np.inf:
+        raise ManifestError(f"depth-unit: found {draft.depth_unit_mm:g}, expected millimeters per unit, such as 0.2.")
     if draft.hold_out and (draft.hold_out < 2 or split != "map"):
         raise ManifestError(f"hold-out: found {draft.hold_out} for a {split}, expected 2 or more, for a map.")
     if draft.hold_out:
