@@ -620,6 +620,16 @@ def test_names_that_the_format_cannot_hold_are_left_out(folder: Path, tmp_path: 
     assert status["../outside.jpg"] == "not a path inside the folder of images"
 
 
+def test_tables_of_other_tools_say_how_they_are_imported(tmp_path: Path) -> None:
+    PIL.Image.new("RGB", (64, 48)).save(tmp_path / "a.jpg")
+    (tmp_path / "cameras.csv").write_text("#name,x,y,alt,heading,pitch,roll,f,px,py\na.jpg,1,2,3,10,20,30,29,0,0\n")
+    with pytest.raises(CaptureError, match=r"cameras\.csv: found angles .* RealityScan .* Export as COLMAP there"):
+        import_images(tmp_path, tmp_path / "PLACE", split="map", table=tmp_path / "cameras.csv")
+    (tmp_path / "images.txt").write_text("# Image list with two lines of data per image:\n1 1 0 0 0 0 0 0 1 a.jpg\n\n")
+    with pytest.raises(CaptureError, match=r"images\.txt: not a CSV table. Import its folder by .* import colmap"):
+        import_images(tmp_path, tmp_path / "PLACE", split="map", table=tmp_path / "images.txt")
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

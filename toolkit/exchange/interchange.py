@@ -408,6 +408,11 @@ def _read_table(path: Path) -> pd.DataFrame:
     of_hloc = len(first) > 4 and first[1] in pycolmap.CameraModelId.__members__
     rows = _read_hloc_list(text) if of_hloc else read_csv(path)
     columns = ("image", *POSE_NAMES, "timestamp", "camera_id", *_CAMERA_COLUMNS)
+    if {"heading", "pitch", "roll"} <= set(rows.columns):
+        do = "Export as COLMAP there, and import that by `python -m toolkit import colmap`."
+        raise CaptureError.at(path, "angles (heading, pitch, roll), as RealityScan writes them", "quaternions", do)
+    if path.name == "images.txt" and "image" not in rows:
+        raise CaptureError(f"{path}: not a CSV table. Import its folder by python -m toolkit import colmap.")
     for name, count in Counter(rows.columns[:-1]).items():
         if name not in columns:
             raise CaptureError(f"{path}: unknown column {name!r}. {nearest(name, columns)}")
