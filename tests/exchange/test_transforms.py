@@ -179,12 +179,15 @@ def test_images_that_cannot_be_used_are_rows(tmp_path: Path) -> None:
     outside = {"file_path": "../outside.jpg", "transform_matrix": matrix(4)}
     PIL.Image.new("RGB", SIZE).save(tmp_path.parent / "outside.jpg")
     long = {"file_path": "x" * 300, "transform_matrix": matrix(5)}
-    file.write_text(json.dumps(content | {"frames": [*content["frames"], outside, long]}))
+    lost = {"file_path": "images/lost.jpg", "transform_matrix": [[float("nan")] * 4] * 4}
+    PIL.Image.new("RGB", SIZE).save(tmp_path / "images" / "lost.jpg")
+    file.write_text(json.dumps(content | {"frames": [*content["frames"], outside, long, lost]}))
     status = import_transforms(file, tmp_path / "PLACE").images.set_index("image")["status"]
     assert status["images/0.jpg"] == "imported"
     assert status["images/1.jpg"] == status["x" * 300] == "no such file"
     assert status["images/2.jpg"] == "the image is stored as 64 x 48 pixels, its camera has 65 x 48"
     assert status["../outside.jpg"] == "not a path inside the folder of images"
+    assert "frame 5 (images/lost.jpg), transform_matrix: found [[nan" in status["images/lost.jpg"]
 
 
 def test_images_of_another_size_or_place_say_what_to_do(tmp_path: Path) -> None:
