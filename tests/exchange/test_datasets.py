@@ -220,6 +220,16 @@ def test_depth_maps_of_data_sets_are_in_meters_and_in_their_own_camera(kind: str
         assert (seen.pixels[:, 0].min() > 30) == (kind == "7scenes")
 
 
+def test_a_split_without_depth_maps_stops_no_other(tmp_path: Path) -> None:
+    seven_scenes(tmp_path / "7")
+    for path in (tmp_path / "7" / "chess" / "seq-03").glob("*.depth.png"):
+        path.unlink()
+    report = import_dataset("7scenes", tmp_path / "7", tmp_path / "A", "chess")
+    assert report.held_out is not None
+    assert report.record["depth maps"][0] == 2
+    assert report.held_out.record["depth maps"] is None
+
+
 def test_images_without_a_pose_are_rows(tmp_path: Path) -> None:
     seven_scenes(tmp_path / "7")
     queries = import_dataset("7scenes", tmp_path / "7", tmp_path / "A", "chess").held_out

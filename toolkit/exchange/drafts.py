@@ -234,6 +234,9 @@ class Draft(Options):
             draft.follow()
             draft.leave_out()
             draft.prepared = draft._prepare()  # all errors come before a session is written
+        if self.depth is not None and not any(draft.prepared and draft.prepared[-1] for draft in drafts):
+            expected = f"that of {self.images[0].name} under the same name, or with `depth` for `color`"
+            raise CaptureError(f"{self.depth}: no depth map of an image. Expected {expected}.")
         if self.listed_in:
             listed |= {_composed(name) for draft in drafts for name in draft._names()}
             self.others[f"not in {self.listed_in}"] = self._others_than(listed)
@@ -564,20 +567,13 @@ class Draft(Options):
         return [rows[time_us] for time_us in sorted(rows)]
 
     def _find_depths(self, times: Mapping[str, int]) -> dict[Path, tuple[int, str, str]]:
-        """Return the rows of depths.txt by the file of the depth map.
-
-        Raises:
-            CaptureError: there is none of the images.
-        """
+        """Return the rows of depths.txt by the file of the depth map."""
         if self.depth is None:
             return {}
         folder, images = Path(self.depth), {self.source(image.name).resolve() for image in self.images}
         files = [name for name in walk_files(folder)[0] if name.lower().endswith(".png")]
         files = [name for name in files if (folder / name).resolve() not in images]
         found = find_depths(folder, files, {image.name: times[image.frame] for image in self.images})
-        if not found:
-            expected = f"that of {self.images[0].name} under the same name, or with `depth` for `color`"
-            raise CaptureError(f"{folder}: no depth map of an image among {len(files)} PNG files. Expected {expected}.")
         measured = ((found[image.name], image) for image in self.images if image.name in found)
         return {
             file: (times[image.frame], self._depth_sensor(image.sensor), f"{SUBSESSION}/depth/{image.name}.png")
