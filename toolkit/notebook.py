@@ -215,15 +215,12 @@ def own_folder(folder: str | None, scene: str, images: str | None = None) -> Pat
     return beside.with_name(f"{beside.name}-localized")
 
 
-def readable(table: "pd.DataFrame", unit: str = "m") -> "pd.DataFrame":
+def readable(table: "pd.DataFrame") -> "pd.DataFrame":
     """Return a stage's table in a form that fits a page: rows `<query> in <map>`, medians and recall first, no folders.
 
     Columns without information are dropped: a `reason` that is always empty, a `state` that is always `evaluated`, and
-    `localized`, the sum of `ok` and `low_confidence`. Columns of lengths end in their `unit`. Column names are
-    shortened where the unit implies the quantity.
+    `localized`, the sum of `ok` and `low_confidence`. Column names are shortened where the unit implies the quantity.
     """
-    from toolkit.results.metrics import named_by_unit
-
     trivial = {"state": "evaluated", "reason": ""}
     dropped = [name for name, text in trivial.items() if name in table and (table[name] == text).all()]
     shown = table.drop(columns=["path", "localized", *dropped], errors="ignore")
@@ -233,7 +230,7 @@ def readable(table: "pd.DataFrame", unit: str = "m") -> "pd.DataFrame":
         shown[name] = [Path(path).name for path in shown[name]]
     first = [name for word in ("median", "recall@") for name in shown if name.startswith(word)]
     shown = shown[[*first, *(name for name in shown if name not in first)]]
-    return named_by_unit(shown, unit).rename(columns=_short_column)
+    return shown.rename(columns=_short_column)
 
 
 def linked(table: "pd.DataFrame", sessions_root: Path) -> "Styler":
@@ -259,7 +256,7 @@ def _short_column(name: str) -> str:
     """Return `median_deg` for `median_rotation_deg`, and `recall@1°,0.1m` for `recall@(1deg,0.1m)`."""
     if name.startswith("recall@("):
         return name.replace("deg", "°").replace("(", "").replace(")", "")
-    return re.sub(r"(rotation|translation)_(?=\w*(deg|m)$)", "", name)
+    return re.sub(r"(rotation|translation)_(?=\w*(deg|m|L)$)", "", name)
 
 
 def choose_photograph(scene_map: Any) -> None:
