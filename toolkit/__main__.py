@@ -686,11 +686,12 @@ def export_matches(
     session1: Annotated[str, Argument(help="Session of the second images; the same for the pairs of a map.")],
     out: Annotated[Path, Argument(help="HDF5 file.")],
     kind: Annotated[str, Option(help="Kind of features.")] = "sift",
+    capture: Capture = None,
 ) -> None:
     """Write the matches of two sessions in hloc's format."""
     from toolkit.exchange import hloc
 
-    print(f"{out}: {hloc.export_matches(run, scene, session0, session1, out, kind)} pairs")
+    print(f"{out}: {hloc.export_matches(run, scene, session0, session1, out, kind, capture)} pairs")
 
 
 _OUT_GEO = "File to write: .csv, or .geojson."

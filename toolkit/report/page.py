@@ -26,6 +26,7 @@ from toolkit.files import (
     read_json,
     read_map_record,
     sidecar_path,
+    write_sidecar,
     write_text,
 )
 from toolkit.pose.result import Status, status_counts, statuses
@@ -131,8 +132,11 @@ def write_report(run_dir: str | Path) -> Path:
         parameters=[(_stage_name(row), _json(row["parameters"])) for row in run["stages"] if row.get("parameters")],
         left_out=left_out,
     )
-    write_text(run_dir / "report.html", page)
-    return run_dir / "report.html"
+    path = run_dir / "report.html"
+    write_text(path, page)
+    shown = [*run_dir.glob("*/evaluation/*.csv"), *run_dir.glob("*/poses/*.csv"), run_dir / "run.json"]
+    write_sidecar(path, {}, made_from=sorted(shown))
+    return path
 
 
 def read_run(path: Path) -> dict[str, Any]:
