@@ -16,6 +16,7 @@ from toolkit.evaluate import draw_evaluation, evaluate_scene, pose_errors, recal
 from toolkit.files import write_sidecar
 from toolkit.geometry import make_pose, pose_error
 from toolkit.mapping.local_map import LocalMap
+from toolkit.results import metrics
 
 CAMERA_MODEL = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[500, 500, 320, 240])
 CAMERA = ("camera", "PINHOLE", "640", "480", "500", "500", "320", "240")
@@ -215,6 +216,24 @@ def test_a_pose_of_unknown_scale_is_not_drawn_over_its_stated_deviation(scene):
     (axis,) = draw_evaluation(evaluate_ios(scene))["deviations"].axes
     drawn = [line.get_xydata() for line in axis.lines if line.get_alpha()]
     np.testing.assert_allclose(np.concatenate(drawn), [(0.01, 0.01), (0.1, 0.2)])
+
+
+def test_lengths_of_an_unknown_unit_are_named_so_in_memory_too(scene, tmp_path):
+    (scene[1] / "TINY_map_ios.json").write_text('{"unit": null, "depth": 30}')
+    result = evaluate_ios(scene, out=tmp_path)
+    for name, table in (("recall", result.recall), ("errors", result.errors), ("retrieval", result.retrieval)):
+        assert not [column for column in table if column.endswith("_m")]
+        assert list(pd.read_csv(tmp_path / f"{name}.csv")) == list(table)
+    assert result.recall["median_translation_L"].item() == pytest.approx((0.2 + 3) / 2 / 3)
+
+
+def test_pairs_in_meters_and_in_an_unknown_unit_keep_their_names():
+    one, other = pd.DataFrame({"translation_error_m": [1.0]}), pd.DataFrame({"translation_error_m": [2.0]})
+    both = pd.concat([metrics.named_by_unit(one, "m"), metrics.named_by_unit(other, "L")], ignore_index=True)
+    assert list(both) == ["translation_error_m", "translation_error_L"]
+    assert metrics.named_as_meters(both)["translation_error_m"].tolist() == [1, 2]
+    assert list(metrics.named_as_meters(both)) == ["translation_error_m"]
+    assert metrics.unit_of("recall@(1deg,0.1m)", "recall@(1deg,0.1L)") == "m or L"
 
 
 def test_the_unit_is_that_of_the_pairs_that_were_evaluated(scene):

@@ -16,6 +16,7 @@ from toolkit.capture import Trajectory
 from toolkit.errors import ArtifactError, ManifestError
 from toolkit.evaluate import evaluate_scene
 from toolkit.exchange.export import export_colmap, export_pairs, export_poses
+from toolkit.exchange.hloc import export_matches
 from toolkit.exchange.submission import collect
 from toolkit.figures.retrieval import RetrievedPair
 from toolkit.files import (
@@ -34,6 +35,8 @@ from toolkit.report.comparison import compare_runs
 from toolkit.report.page import write_report
 from toolkit.scene.inspection import InspectedPair
 from toolkit.scene.map import Map
+from toolkit.scene.run import Run
+from toolkit.store.items import Items
 from toolkit.visualize import visualize_scene
 
 
@@ -166,7 +169,16 @@ def exported_poses(files: SceneFiles, capture: Path) -> str:
     return str(export_poses(files.run, files.scene, "ios", "hl", files.run / "hloc.txt", capture))
 
 
+def exported_matches(files: SceneFiles, capture: Path) -> str:
+    return str(export_matches(files.run, files.scene, "ios_map", "ios_map", files.run / "hloc.h5", capture=capture))
+
+
+def linked_report(files: SceneFiles, capture: Path) -> str:
+    return str(Run.open(files.run).report())
+
+
 POSES, TABLE, REFERENCES, MAP, VECTORS = "poses txt", "poses csv", "references", "map", "vectors"
+FEATURES, RECORD = "features", "run.json"
 READERS = [
     (POSES, reported, "Not shown: recall.csv is of an older poses/"),
     (TABLE, reported, "Not shown: recall.csv is of an older poses/"),
@@ -187,6 +199,10 @@ READERS = [
     (VECTORS, exported_pairs, "run the retrieve stage again"),
     (REFERENCES, exported_poses, "run the localize stage again"),
     (MAP, exported_poses, "run the localize stage again"),
+    (FEATURES, exported_map, "of other images or features: run the localize stage again"),
+    (FEATURES, exported_matches, "of other images or features: run the localize stage again"),
+    (TABLE, linked_report, "is of an older poses/"),
+    (RECORD, linked_report, "Write it again: python -m toolkit report"),
 ]
 
 
@@ -199,6 +215,17 @@ def change(files: SceneFiles, what: str) -> None:
         path.unlink()  # a link to the finished run
         np.save(path, -vectors)
         write_sidecar(path, read_sidecar(path) or {"embedder": "other"})
+        return
+    if what == FEATURES:
+        with Items(next((files.features / "ios_map").glob("sift-*"))) as items:
+            first = next(iter(items))
+            items.add(first, "another picture", items[first])
+        return
+    if what == RECORD:
+        record = files.run / "run.json"
+        text = record.read_text()
+        record.unlink()
+        record.write_text(text.replace('"status": "done"', '"status": "running"'))
         return
     table = poses.with_suffix(".csv")
     path = {POSES: poses, TABLE: table, REFERENCES: references, MAP: files.maps / "ios_map.npz"}[what]
@@ -316,9 +343,22 @@ def test_a_notebook_by_hand_gives_the_poses_of_a_run(
     pd.testing.assert_frame_equal(by_run.drop(columns="seconds"), by_hand.drop(columns="seconds"))
 
 
-def test_the_results_of_a_notebook_by_hand_do_not_go_into_a_run(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("stage", "name", "folder"),
+    [("embed", "out_dir", "C/embeddings"), ("embed", "out_dir", "."), ("localize", "features_dir", "C/features"),
+     ("localize", "map_dir", "C/map"), ("rerank", "features_dir", "C/features"), ("sequence", "out_dir", "C/poses")],
+)  # fmt: skip
+def test_what_a_notebook_by_hand_writes_does_not_go_into_a_run(
+    tmp_path: Path, small_capture: Path, stage: str, name: str, folder: str
+) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "run.json").write_text("{}")
-    with pytest.raises(ManifestError, match="changes only by its manifest"):
-        notebook.start("embed", sessions_root="C/sessions", out_dir=str(tmp_path / "run" / "C" / "embeddings"))
+    with pytest.raises(ManifestError, match=rf"{name}: .*changes only by its manifest"):
+        notebook.start(stage, sessions_root=str(small_capture / "sessions"), **{name: str(tmp_path / "run" / folder)})
     assert not (tmp_path / "run" / "C").exists()
+
+
+def test_a_capture_of_ones_own_does_not_go_into_a_run(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text("{}")
+    with pytest.raises(ManifestError, match=r"out_dir: .*changes only by its manifest"):
+        notebook.own_folder(str(tmp_path), "own-images")

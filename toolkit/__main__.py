@@ -202,7 +202,9 @@ def localize(
         row |= {"inliers": result.num_inliers, "remark": result.remark}
         if result.world_from_rig is not None:
             poses.append(result.world_from_rig)
-            row |= {"world_from_cam": result.world_from_rig.tolist(), "position_std_m": result.position_std_m}
+            unknown = {} if place.settings.unit else {"unit": "unknown"}  # as in a table of poses
+            row |= {"world_from_cam": result.world_from_rig.tolist(), **unknown}
+            row["position_std" if unknown else "position_std_m"] = result.position_std_m
             if origin is not None:
                 geo = geographic_poses(poses[-1][None], origin)[0].tolist()
                 row |= {name: None if np.isnan(one) else one for name, one in zip(GEO_COLUMNS, geo, strict=True)}
@@ -685,11 +687,12 @@ def export_matches(
     session1: Annotated[str, Argument(help="Session of the second images; the same for the pairs of a map.")],
     out: Annotated[Path, Argument(help="HDF5 file.")],
     kind: Annotated[str, Option(help="Kind of features.")] = "sift",
+    capture: Capture = None,
 ) -> None:
     """Write the matches of two sessions in hloc's format."""
     from toolkit.exchange import hloc
 
-    print(f"{out}: {hloc.export_matches(run, scene, session0, session1, out, kind)} pairs")
+    print(f"{out}: {hloc.export_matches(run, scene, session0, session1, out, kind, capture)} pairs")
 
 
 _OUT_GEO = "File to write: .csv, or .geojson."

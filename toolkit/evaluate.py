@@ -78,7 +78,7 @@ def evaluate_scene(
     """Evaluate the poses of all pairs of a scene and write tables and figures.
 
     A pair without poses, without queries or without ground truth gets a row that says so. If the unit of the poses is
-    unknown, lengths are in `metrics.UNKNOWN_UNIT` instead of meters; in the files, their columns end in `_L`, not `_m`.
+    unknown, lengths are in `metrics.UNKNOWN_UNIT` instead of meters; their columns end in `_L`, not `_m`.
 
     Args:
         sessions_root: folder `sessions/` of the capture.
@@ -145,7 +145,7 @@ def evaluate_scene(
             elif references_dir is not None:
                 lengths = length, record["length"] or length
                 path = Path(references_dir) / f"{name}.jsonl"
-                row, good = _retrieval_recall(path, keys, truth, capture[f"{map_}_map"], *lengths)
+                row, good = _retrieval_recall(path, keys, truth, capture[f"{map_}_map"], unit, *lengths)
                 rows["retrieval"].append({**pair, **row})
                 if good is None:
                     messages.append(f"{name}: {row['state']}, so no miss is attributed to retrieval.")
@@ -158,7 +158,7 @@ def evaluate_scene(
             if state != "evaluated":
                 messages.append(f"{name}: {state}.")
             frame = _errors_of(results, keys, truth, session, good, limits, at, unit, length)
-            errors.append(frame.assign(**pair))
+            errors.append(metrics.named_by_unit(frame.assign(**pair), unit))
             rows["recall"].append({**pair, "state": state, **_summary(frame, limits, unit)})
             rows["losses"] += [{**pair, "state": state, **row} for row in _losses(frame, limits, unit)]
     if not rows["recall"]:
@@ -226,7 +226,7 @@ def evaluate_sequences(
             unit, length = metrics.length_unit(read_map_record(map_record_path(poses_dir, capture.name, map_)))
             pair = {"map_device": map_, "query_device": query}
             steps.append(pd.DataFrame(sequence.recalls(keys, truth, limits, unit, length)).assign(**pair))
-            changed = sequence.changes(keys, truth, limits[-1], length).assign(**pair)
+            changed = metrics.named_by_unit(sequence.changes(keys, truth, limits[-1], length).assign(**pair), unit)
             single = PairResults.of(poses_dir, capture.name, map_, query).table
             # Results of earlier versions have no names of images.
             images = single.reindex(columns=[*(key := ["timestamp", "device_id"]), "image"], fill_value="")
@@ -266,7 +266,7 @@ def write_evaluation(
         written.append(path)
         if isinstance(content, pd.DataFrame):
             with write_atomic(path) as temporary:
-                metrics.named_by_unit(content, evaluation.unit).to_csv(temporary, index=False)
+                content.to_csv(temporary, index=False)
         else:
             save_figure(content, path)
     write_sidecar(out / "recall.csv", settings, written[1:], made_from=sources)
@@ -409,13 +409,14 @@ def _retrieval_recall(
     keys: pd.DataFrame,
     truth: Trajectory | None,
     map_session: Session,
+    unit: str,
     length: float,
     map_length: float,
 ) -> tuple[dict[str, Any], NDArray[np.bool_] | None]:
     """Return a pair's row of the table `retrieval`, and whether each query has a good reference (None if unreadable).
 
     Args:
-        length: the unit of lengths in the table, in the unit of the poses.
+        unit, length: the unit of lengths in the table, and its length in the unit of the poses.
         map_length: `Survey.length`, in the unit of the poses: far scenes show the same from further apart.
     """
     if not path.is_file():
@@ -442,7 +443,7 @@ def _retrieval_recall(
     by_device = keys.merge(frame.agg(rank=("rank", "min"), in_map=("in_map", "any")), how="left")
     rank = by_device["rank"].fillna(np.inf).to_numpy(float)
     row: dict[str, Any] = {"state": "evaluated", "queries": len(keys), "angle_deg": RETRIEVAL_ANGLE_DEG}
-    row["radius_m"] = round(reach[0] / length, 4)
+    row[f"radius_{unit}"] = round(reach[0] / length, 4)
     row |= {f"recall@{k}": float(np.mean(rank < k)) for k in RETRIEVAL_KS}
     return {**row, "in_map": float(by_device["in_map"].eq(True).mean())}, np.isfinite(rank)
 

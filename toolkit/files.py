@@ -330,31 +330,39 @@ def changed_sources(artifact: str | Path) -> list[Path]:
     return [path for path, content in paths if _content(path) != content]
 
 
-def why_older(artifact: str | Path, stage: str, suffixes: Iterable[str] = (), missing: bool = True) -> str:
+def why_older(
+    artifact: str | Path, stage: str, suffixes: Iterable[str] = (), missing: bool = True, inputs: str | None = None
+) -> str:
     """Return a sentence that says which sources of an artifact have changed since it was made; empty if none has.
 
     Args:
         stage: the stage that makes it again.
         suffixes: only sources with these suffixes; empty: all.
         missing: whether a source that is missing counts as changed.
+        inputs: fingerprint of what is no file of its own, as the artifact's settings record it under `inputs`.
     """
     changed = [path for path in changed_sources(artifact) if missing or path.exists()]
     changed = [path for path in changed if not suffixes or path.suffix in suffixes]
+    name = Path(artifact).name
     if not changed:
-        return ""
-    name, first = Path(artifact).name, f"{changed[0].parent.name}/{changed[0].name}"
+        made_of = _read_record(artifact).get("settings", {}).get("inputs") or inputs
+        other = f"{name} is of other images or features: run the {stage} stage again."
+        return "" if made_of == (inputs or made_of) else other
+    first = f"{changed[0].parent.name}/{changed[0].name}"
     more = f" (and of {len(changed) - 1} more that changed)" if len(changed) > 1 else ""
     found = f"is of an older {first}{more}" if changed[0].exists() else f"is of {first}, which is missing now"
     return f"{name} {found}: run the {stage} stage again."
 
 
-def require_current(artifact: str | Path, stage: str, suffixes: Iterable[str] = (), missing: bool = True) -> None:
+def require_current(
+    artifact: str | Path, stage: str, suffixes: Iterable[str] = (), missing: bool = True, inputs: str | None = None
+) -> None:
     """Refuse an artifact whose sources have changed since it was made; see `why_older`.
 
     Raises:
         ArtifactError: names the artifact and the first source.
     """
-    if why := why_older(artifact, stage, suffixes, missing):
+    if why := why_older(artifact, stage, suffixes, missing, inputs):
         raise ArtifactError(f"{Path(artifact).parent}: {why}")
 
 
@@ -454,7 +462,9 @@ def project_root() -> Path:
     return next((folder for folder in (here, *here.parents) if (folder / "data_manifests").is_dir()), here)
 
 
-RUN_FILES = ("notebooks", "report.html", "run.json", "run.log", "submission.csv", "submission.zip")
+RUN_FILES = (
+    "notebooks", "report.html", "report.html.meta.json", "run.json", "run.log", "submission.csv", "submission.zip"
+)  # fmt: skip
 """Files and folders of a run beside its scenes; no scene can have one of these names."""
 
 
@@ -490,6 +500,11 @@ class SceneFiles:
             "evaluate": self.evaluation,
             "visualize": self.visualization,
         }.get(stage)
+
+    @property
+    def caches(self) -> tuple[Path, ...]:
+        """Folders in which every stage finds what fits its settings, whatever run has made it."""
+        return self.features, self.maps, self.index
 
     def folders(self, stage: str) -> dict[str, Path]:
         """Return the folders through which stages exchange results, by the names of the notebooks' parameters."""

@@ -209,9 +209,7 @@ class _Stage(Remade):
         self.folders, self.queries = folders, queries
         self.skip_existing, self.workers = skip_existing, workers or default_workers()
         self.capture = Capture.from_sessions_root(folders.sessions)
-        if settings.unit == "auto":
-            settings = LocalizeSettings.of(settings, {"unit": self.capture.unit})
-        self.settings = settings
+        self.settings = settings = LocalizeSettings.of(settings, {"unit": self.capture.unit_of(settings.unit)})
         """With the capture's unit instead of `auto`."""
         self.kinds, self.escalation = create_methods(settings)
         self.predictor = open_predictor(settings, self.capture, folders.map) if settings.predicts else None

@@ -51,6 +51,7 @@ from toolkit.manifest.messages import explain
 from toolkit.runs.folder import LOG_VARIABLE, RECORD, counts_text, log_to
 from toolkit.runs.kernel import TEXT_BARS, Kernels, MemoryWatch, kernel_error
 from toolkit.runs.pairs import left_out_of
+from toolkit.runs.sweep import TAKEN
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -78,6 +79,9 @@ UPSTREAM: dict[str, tuple[str, ...]] = {
     "evaluate": ("retrieve", "rerank", "localize", "sequence"),
     "visualize": ("retrieve", "localize", "sequence"),
 }
+
+_FILLED = {"rerank": ("features_dir",), "localize": ("features_dir", "map_dir")}
+"""Parameters of notebooks that name a cache which their stage adds to."""
 
 # nbconvert's page, without the scripts that it loads from other servers.
 _PAGE = """{% extends "lab/index.html.j2" %}
@@ -166,7 +170,8 @@ def start(
     resolved = {"sessions_root": sessions}
     for name, folder in folders.items():
         resolved[name] = Path(folder).expanduser().resolve() if folder else defaults[name]
-        if folder and run_log is None and defaults[name] == files.of_stage(stage):
+        written = defaults[name] == files.of_stage(stage) or name in _FILLED.get(stage, ())
+        if folder and run_log is None and written:
             _require_outside_of_runs(name, resolved[name])
     return Folders(stage, None if run_log else source, **resolved)
 
@@ -184,7 +189,7 @@ def is_demo(run: Path) -> bool:
 
 def _require_outside_of_runs(name: str, folder: Path) -> None:
     """Refuse a folder of results, the value of the parameter `name`, that belongs to a finished run."""
-    run = next((parent for parent in folder.parents if (parent / RECORD).is_file()), None)
+    run = next((parent for parent in (folder, *folder.parents) if (parent / RECORD).is_file()), None)
     if run is not None:
         found = f"a folder of the run {run}, which changes only by its manifest"
         raise ManifestError.at(name, found, do="Leave it out, or give another folder.")
@@ -208,6 +213,7 @@ def own_folder(folder: str | None, scene: str, images: str | None = None) -> Pat
         images: folder of images; the default is `<images>-localized` beside it.
     """
     if folder is not None:
+        _require_outside_of_runs("out_dir", Path(folder).expanduser().resolve())
         return Path(folder).expanduser().resolve()
     if images is None:
         return project_root() / "data" / scene
@@ -215,15 +221,12 @@ def own_folder(folder: str | None, scene: str, images: str | None = None) -> Pat
     return beside.with_name(f"{beside.name}-localized")
 
 
-def readable(table: "pd.DataFrame", unit: str = "m") -> "pd.DataFrame":
+def readable(table: "pd.DataFrame") -> "pd.DataFrame":
     """Return a stage's table in a form that fits a page: rows `<query> in <map>`, medians and recall first, no folders.
 
     Columns without information are dropped: a `reason` that is always empty, a `state` that is always `evaluated`, and
-    `localized`, the sum of `ok` and `low_confidence`. Columns of lengths end in their `unit`. Column names are
-    shortened where the unit implies the quantity.
+    `localized`, the sum of `ok` and `low_confidence`. Column names are shortened where the unit implies the quantity.
     """
-    from toolkit.results.metrics import named_by_unit
-
     trivial = {"state": "evaluated", "reason": ""}
     dropped = [name for name, text in trivial.items() if name in table and (table[name] == text).all()]
     shown = table.drop(columns=["path", "localized", *dropped], errors="ignore")
@@ -233,7 +236,7 @@ def readable(table: "pd.DataFrame", unit: str = "m") -> "pd.DataFrame":
         shown[name] = [Path(path).name for path in shown[name]]
     first = [name for word in ("median", "recall@") for name in shown if name.startswith(word)]
     shown = shown[[*first, *(name for name in shown if name not in first)]]
-    return named_by_unit(shown, unit).rename(columns=_short_column)
+    return shown.rename(columns=_short_column)
 
 
 def linked(table: "pd.DataFrame", sessions_root: Path) -> "Styler":
@@ -259,7 +262,7 @@ def _short_column(name: str) -> str:
     """Return `median_deg` for `median_rotation_deg`, and `recall@1°,0.1m` for `recall@(1deg,0.1m)`."""
     if name.startswith("recall@("):
         return name.replace("deg", "°").replace("(", "").replace(")", "")
-    return re.sub(r"(rotation|translation)_(?=\w*(deg|m)$)", "", name)
+    return re.sub(r"(rotation|translation)_(?=\w*(deg|m|L)$)", "", name)
 
 
 def choose_photograph(scene_map: Any) -> None:
@@ -388,27 +391,27 @@ def check_parameters(path: Path, parameters: Iterable[str]) -> None:
 
 
 _TAKEN = ".taken.json"
-_RESULTS, _CACHES = ("embeddings", "retrieval", "reranked", "poses"), ("features", "map", "index")
-"""Folders that notebooks by hand take from a run. Caches are taken once: stages find in them what still fits."""
 
 
 def _take_from_run(stage: str, files: SceneFiles, run: Path | None) -> None:
     """Fill the folder of notebooks by hand, as far as no notebook has made results there, with hard links.
 
-    They lead to results of a finished run. If that run changes, its new results are taken.
+    They lead to results of a finished run. If that run changes, its new results are taken. Caches are taken once, as
+    stages find in them what still fits.
     """
     taken, made_here = read_json(files.root / _TAKEN), files.of_stage(stage)
     if made_here is not None:
         taken.pop(made_here.name, None)  # the links stay until the stage replaces them; from now on they are its own
-    for name in (*_RESULTS, *_CACHES):
-        target = files.root / name
+    results = {folder for stage in TAKEN if (folder := files.of_stage(stage))}
+    for target in (*sorted(results), *files.caches):
+        name = target.name
         if run is None or target == made_here or (target.exists() and name not in taken):
             continue
         source, state = run / files.scene / name, f"{run}, {read_json(run / RECORD).get('created')}"
         if source.is_dir() and taken.get(name) != state:
             shutil.rmtree(target, ignore_errors=True)
             link_folder(source, target)
-            taken |= {name: state} if name in _RESULTS else {}
+            taken |= {name: state} if target in results else {}
             print(f"{name}: taken from {run}")
     if taken or (files.root / _TAKEN).exists():
         write_text(files.root / _TAKEN, json.dumps(taken) + "\n")

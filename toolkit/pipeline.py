@@ -610,6 +610,7 @@ def _run_job(job: Job, inputs: str, head: str, record: RunLog, say: Say, kernels
     row |= {"notebook": str(job.notebook.relative_to(job.files.run)), "parameters": job.parameters}
     # There is no record while the stage runs, so a killed stage runs again.
     job.record.unlink(missing_ok=True)
+    (job.files.run / "report.html").unlink(missing_ok=True)  # nor is the report current until it is written again
     started, logged = time.perf_counter(), (job.files.run / LOG).stat().st_size
     try:
         notebook, memory = execute(notebook_path(job.stage), job.notebook, job.parameters, line, kernels)

@@ -217,12 +217,12 @@ class _Pair:
         references = [
             {
                 **reference,
-                "score": inliers,
+                "score": verified,
                 "num_matches": matches,
                 "retrieval_score": reference["score"],
                 "retrieval_rank": reference["rank"],
             }
-            for reference, (inliers, matches) in zip(query["topk"][: self.settings.topn], counts, strict=False)
+            for reference, (verified, matches) in zip(query["topk"][: self.settings.topn], counts, strict=False)
         ]
         references.sort(key=lambda row: (-row["score"], row["retrieval_rank"]))
         ranked = [row | {"rank": rank} for rank, row in enumerate(references[: self.settings.topk], start=1)]

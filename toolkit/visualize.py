@@ -22,7 +22,7 @@ from toolkit.files import pair_name, require_current, sidecar_path, write_sideca
 from toolkit.geometry import Floats
 from toolkit.manifest import VisualizeSettings
 from toolkit.results.localized import LocalizedPair, support_of, sure_points
-from toolkit.results.metrics import is_posed, worst_first
+from toolkit.results.metrics import is_posed, named_as_meters, worst_first
 from toolkit.runs.pairs import PairRows, left_out
 from toolkit.viewer.queries import record_localizations
 from toolkit.viewer.sessions import record_session, session_tracks
@@ -202,7 +202,7 @@ def _poses(capture: Capture, poses_dir: str | Path, map_device: str, query_devic
 def _draw_worst(path: Path, scene: str, candidates: pd.DataFrame) -> None:
     """Draw the worst queries of all pairs; `candidates` are the rows of `_draw_pair`."""
     shown = []
-    for _, row in candidates.iloc[worst_first(candidates)[:WORST]].iterrows():
+    for _, row in named_as_meters(candidates.iloc[worst_first(candidates)[:WORST]]).iterrows():
         has_matches, reason = row["details"].has_matches, [textwrap.shorten(row["status"], 72, placeholder=" …")]
         if has_matches and pd.notna(row.get("num_matches")):
             reason.append(f"{row['num_matches']:.0f} matches")

@@ -81,7 +81,7 @@ def test_a_rig_shows_the_camera_with_the_most_inliers_first(capture, open_pair):
     found = some_correspondences([0, 0, 0, 1, 1, 1], [True, False, False, True, True, True])
     details = open_pair("hl", stored(images[::-1], names(capture["ios_map"], 1), [], found)).details(0)
     assert [camera.name for camera in details.cameras[:2]] == [images[-2], images[-1]]
-    assert [camera.num_inliers for camera in details.cameras[:2]] == [3, 1]
+    assert [camera.num_agreeing for camera in details.cameras[:2]] == [3, 1]
     np.testing.assert_array_equal(details.cameras[0].pixels, found.pixels[3:])
     figure = draw_localization(details)
     titles = [axis.get_title() for axis in figure.axes]

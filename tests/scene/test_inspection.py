@@ -1,6 +1,7 @@
 """One query of a run under the glass: it shows what was stored, and localizes again as the run did."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -197,6 +198,13 @@ def test_both_answers_are_drawn_at_the_same_camera_of_a_rig(pair: InspectedPair)
     np.testing.assert_allclose(second.get_center(), first.get_center(), atol=1e-9)
 
 
+def test_a_figure_has_one_number_called_inliers(pair: InspectedPair) -> None:
+    for number in range(len(pair)):
+        one = pair.look(number)
+        assert len(set(re.findall(r"(\d+) inliers|inliers[^\d\n]*(\d+)", text_of(one.figure)))) <= 1
+        assert [label for label in one.texts if "inliers" in label] == ["inliers among them"]
+
+
 def test_lengths_of_an_unknown_unit_are_not_meters(small_capture: Path, tmp_path: Path) -> None:
     off = [0.0, 0.3, 0.02]
     pair = written(small_capture, tmp_path, [stored()] * 3, off_m=off, position_std_m=[0.01, 0.2, 0.03])
@@ -207,7 +215,8 @@ def test_lengths_of_an_unknown_unit_are_not_meters(small_capture: Path, tmp_path
     assert one.error[1] == pytest.approx(0.06)
     spread = np.diag([0.0, 0.0, 0.0, 0.2**2, 0.0, 0.0])
     one = replace(one, result=replace(one.result, covariance=spread))
-    assert one.numbers["position_std_m"] == pytest.approx(0.04)
+    assert one.numbers["position_std_L"] == pytest.approx(0.04)
+    assert "position_std_m" not in one.numbers
     text = text_of(one.figure)
     assert "std. dev. of position [L]" in text
     assert "[m]" not in text

@@ -81,6 +81,10 @@ class Capture:
         units = [read_json(folder / IMPORT_RECORD).get("unit", "m") for folder in maps or self._folders.values()]
         return None if None in units else "m"
 
+    def unit_of(self, setting: str | None) -> str | None:
+        """Return the unit that a setting `unit` means: `m`, None if it is unknown, or for `auto` that of the import."""
+        return self.unit if setting == "auto" else setting
+
     @property
     def devices(self) -> list[str]:
         """Keys of the devices that have a session."""

@@ -38,6 +38,7 @@ from toolkit.files import (
 from toolkit.geometry import Floats, invert, pose_from_qt, qt_from_pose
 from toolkit.manifest import nearest
 from toolkit.mapping.local_map import LocalMap
+from toolkit.results.opening import map_inputs
 from toolkit.results.pair import PairResults, names_of_maps
 
 NAMES = ("own", "capture", "file")
@@ -56,18 +57,20 @@ def export_colmap(
     the same poses are merged into one.
 
     Raises:
-        ArtifactError: the run has not localized in such a map, or the map was built again since.
+        ArtifactError: the run has not localized in such a map, the map was built again since, or it was built from
+            other images or features than those that are there.
         ManifestError: the folder `out` contains files.
     """
     _require_names(names)
     files, session_id, out = SceneFiles(Path(run), scene), f"{device}_map", Path(out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ManifestError(f"{out}: contains files already. Give an empty or new folder.")
-    session = _session(run, scene, session_id, capture)
+    session = session_of_run(run, scene, session_id, capture)
     maps, keypoints = [], dict[str, NDArray[np.floating]]()
     for path in _maps_of(files, device):
         kind = path.stem.removeprefix(session_id).removeprefix("-") or "sift"  # the naming of `mapping.map_path`
         local_map, store = LocalMap.load(path), FeatureStore.open(only_features(files, session_id, kind))
+        require_current(path, "localize", inputs=map_inputs(session, store))
         # In each image, the keypoints of this kind follow those of the kinds before.
         before = [keypoints.get(name, np.zeros((0, 2))) for name in local_map.image_names]
         starts = np.array([len(xy) for xy in before], np.int64)
@@ -245,7 +248,7 @@ def export_poses(
     """
     _require_names(names)
     path = _require_poses(SceneFiles(Path(run), scene).poses_txt(map_device, query_device))
-    session, poses = _session(run, scene, f"{query_device}_query", capture), Trajectory.read(path)
+    session, poses = session_of_run(run, scene, f"{query_device}_query", capture), Trajectory.read(path)
     lines = []
     keys = pd.DataFrame({"timestamp": poses.timestamps, "device_id": poses.device_ids})
     for rows, world_from_rig in zip(session.rows_of_keyframes(keys), pose_from_qt(poses.qt), strict=True):
@@ -265,7 +268,7 @@ def export_intrinsics(
     """
     _require_names(names)
     path = _require_poses(SceneFiles(Path(run), scene).poses_csv(map_device, query_device))
-    session = _session(run, scene, f"{query_device}_query", capture)
+    session = session_of_run(run, scene, f"{query_device}_query", capture)
     rows = [row for rows in session.rows_of_keyframes(PairResults.open(path).table) for row in rows]
     cameras = [camera_text(camera).replace(",", "") for camera in session.cameras(rows)]
     listed = [_listed(session.image_name(row), names, path) for row in rows]
@@ -305,6 +308,7 @@ def _require_poses(path: Path) -> Path:
     return path
 
 
-def _session(run: str | Path, scene: str, session_id: str, capture: str | Path | None) -> Session:
+def session_of_run(run: str | Path, scene: str, session_id: str, capture: str | Path | None) -> Session:
+    """Return a session of a run's capture, which may have moved to `capture`."""
     with open_captures([Path(run)], [] if capture is None else [capture], [scene]) as capture_of:
         return capture_of(scene)[session_id]

@@ -9,6 +9,7 @@ A file of matches has one group per pair of images, `<image>/<image>` with `/` i
 `matching_scores0` (N,).
 """
 
+import logging
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolkit.errors import ArtifactError, DamagedError, first_line
-from toolkit.exchange.export import only_features
+from toolkit.exchange.export import only_features, session_of_run
 from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures
 from toolkit.features.matching import PairMatches
 from toolkit.features.stores import FeatureStore, MatchStore, features_path, match_name, write_features, write_matches
-from toolkit.files import SceneFiles, files_fingerprint
+from toolkit.files import SceneFiles, files_fingerprint, read_sidecar, require_current
+from toolkit.mapping.local_map import map_path
+from toolkit.results.opening import map_inputs
 from toolkit.store.hdf5 import HDF5_ERRORS, group_names_of, has_group, read_group, write_groups
 from toolkit.store.items import Items
+
+log = logging.getLogger(__name__)
 
 PIXEL_CENTER = "top_left_pixel_center"
 """Attribute of a file of features: the coordinate of the center of the top-left pixel."""
@@ -96,16 +101,19 @@ def _from_hloc(arrays: Mapping[str, NDArray[Any]], offset: np.float32) -> LocalF
 
 
 def export_matches(
-    run: str | Path, scene: str, session0: str, session1: str, out: str | Path, kind: str = "sift"
-) -> int:
+    run: str | Path, scene: str, session0: str, session1: str, out: str | Path, kind: str = "sift",
+    capture: str | Path | None = None,
+) -> int:  # fmt: skip
     """Write the matches of two sessions as a file of hloc, and return the number of pairs.
 
     Args:
         session0, session1: such as `ios_query` and `ios_map`; twice the same for the pairs of a map.
         kind: of the features.
+        capture: new folder of a capture that has moved; needed for the pairs of a map.
 
     Raises:
-        ArtifactError: the run has no such matches, those of several settings, or pairs that hloc cannot tell apart.
+        ArtifactError: the run has no such matches, those of several settings or of older features, or pairs that hloc
+            cannot tell apart.
     """
     files = SceneFiles(Path(run), scene)
     folder = files.maps / f"{session0}-{session1}"
@@ -114,8 +122,13 @@ def export_matches(
     if not made_by or any(other != made_by[0] for other in made_by):
         found = f"found matches of {kind} of {len(made_by)} settings, expected one"
         raise ArtifactError(f"{folder}: {found}. Delete this folder and run the localize stage again.")
-    first = FeatureStore.open(features_path(files.features, session0, made_by[0]["features"][0]))
+    paths = zip((session0, session1), made_by[0]["features"], strict=True)
+    first, second = (FeatureStore.open(features_path(files.features, *of_session)) for of_session in paths)
+    of_map, path = session0 == session1, map_path(files.maps, session0, kind)
+    if of_map and (read_sidecar(path) or {}).get("inputs"):
+        require_current(path, "localize", inputs=map_inputs(session_of_run(run, scene, session0, capture), first))
     groups: dict[str, tuple[str, str]] = {}
+    older: list[tuple[str, str]] = []
 
     def written() -> Iterator[tuple[str, dict[str, NDArray[Any]]]]:
         for tile in tiles:
@@ -123,12 +136,17 @@ def export_matches(
             for item in tile:
                 name0, _, name1 = item.partition("\n")
                 names = name0, name1
+                if not of_map and tile.source(item) != first.made_from.get(name0, "") + second.made_from.get(name1, ""):
+                    older.append(names)
+                    continue
                 if names != groups.setdefault(_group(*names), names):
                     other = groups[_group(*names)]
                     raise ArtifactError(f"{folder}: hloc cannot tell the pairs {names} and {other} apart. Rename one.")
                 yield _group(*names), _matches_to_hloc(matches[names], len(first[names[0]]))
 
     write_groups(Path(out), written(), {})
+    if older:
+        log.warning("%s: %d pairs of older features are left out. Run the localize stage again.", folder, len(older))
     return len(groups)
 
 

@@ -7,7 +7,7 @@ have one folder of matches per kind and settings, with an item per pair of image
 import logging
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -80,6 +80,12 @@ class FeatureStore(Mapping[str, LocalFeatures]):
     def of_session(cls, out: str | Path, session_id: str, settings: Mapping[str, Any] | None = None) -> "FeatureStore":
         """Open a session's features by an extractor's settings, None: SIFT; `out` is the folder of all features."""
         return cls.open(features_path(out, session_id, settings or SiftExtractor().settings))
+
+    def only(self, names: Iterable[str]) -> "FeatureStore":
+        """Return the store with only these images."""
+        chosen = {*names}
+        made_from, failed = ({n: kept[n] for n in kept if n in chosen} for kept in (self.made_from, self.failed))
+        return replace(self, made_from=made_from, failed=failed)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle only the path. A process opens the folder at the first unpickling, and again if it has changed."""

@@ -17,7 +17,7 @@ from toolkit.manifest import RerankSettings
 from toolkit.threads import fixed_sums
 
 MAP_IMAGES_KEPT = 256  # number of map images whose features stay in memory, about 60 MB
-MAX_ERROR_DEG = 0.2  # largest Sampson error of an inlier, as an angle seen from the camera, degrees
+MAX_ERROR_DEG = 0.2  # largest Sampson error of a match that agrees, as an angle seen from the camera, degrees
 MAX_ERROR_SHARE = 0.003  # the same without intrinsics, in multiples of the longer side of the image
 MAX_TRIALS = 500  # largest number of RANSAC samples, of five matches each; the best matches are sampled first
 
@@ -42,7 +42,7 @@ class Verifier:
         references: Sequence[str],
         cameras: Sequence[pycolmap.Camera],
     ) -> tuple[list[int], list[int]]:
-        """Return the numbers of inliers and of matches of a query image with each reference.
+        """Return the numbers of verified and of all matches of a query image with each reference.
 
         Args:
             features, camera: of the query image.
@@ -56,8 +56,8 @@ class Verifier:
             pixels, in_map = features.keypoints[matches.indices[:, 0]], reference.keypoints[matches.indices[:, 1]]
             pair = camera, pixels, cameras[index], in_map, matches.scores
             counts[:, index] = verified_matches(*pair, self.settings, tests=len(readable)).distinct, len(matches)
-        inliers, matched = counts.tolist()
-        return inliers, matched
+        verified, matched = counts.tolist()
+        return verified, matched
 
     def _strongest(self, features: LocalFeatures) -> LocalFeatures:
         return features.take(slice(self.settings.max_features))
@@ -66,7 +66,7 @@ class Verifier:
 class Verified(NamedTuple):
     """The matches that agree with one essential matrix."""
 
-    inliers: Ints  # (A,) indices of these matches
+    agree: Ints  # (A,) indices of these matches
     distinct: int  # their number; those that share a keypoint count once
     essential: Floats  # (3, 3) the essential matrix
 
@@ -91,7 +91,7 @@ def verified_matches(
         pixels_a, pixels_b: (K, 2) matched pixels.
         scores: (K,) scores of the matches, larger is better.
         settings: threshold and limits.
-        tests: number of image pairs that are tested together; with more tests, more inliers can arise by chance.
+        tests: number of image pairs that are tested together; with more tests, more matches can agree by chance.
     """
     nothing = Verified(np.zeros(0, np.int64), 0, np.zeros((3, 3)))
     if len(scores) < 6:  # five matches always agree
@@ -158,27 +158,27 @@ def _prosac(threshold: float, seed: int) -> cv2.UsacParams:
     return options
 
 
-def is_meaningful(inliers: int, matches: int, chance: float, tests: int = 1) -> bool:
-    """Tell whether fewer than one such set of inliers is expected among random matches.
+def is_meaningful(agree: int, matches: int, chance: float, tests: int = 1) -> bool:
+    """Tell whether fewer than one such set of agreeing matches is expected among random matches.
 
     The expected number follows L. Moisan, B. Stival, "A Probabilistic Criterion to Detect Rigid Point Matches Between
     Two Images and Estimate the Fundamental Matrix", IJCV 2004, for a model of five matches and a fixed threshold.
 
     Args:
-        inliers: number of matches that agree with a model.
+        agree: number of matches that agree with a model.
         matches: number of all matches.
         chance: probability that a random match agrees with a model.
         tests: number of sets of matches that are tested.
     """
-    if inliers <= 5:
+    if agree <= 5:
         return False
 
     def log_choose(n: int, k: int) -> float:
         return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
 
     models = 10  # largest number of essential matrices that fit five matches
-    ways = np.log(models * (matches - 5)) + log_choose(matches, inliers) + log_choose(inliers, 5)
-    return bool(np.log(tests) + ways + (inliers - 5) * np.log(min(chance, 1.0)) < 0)
+    ways = np.log(models * (matches - 5)) + log_choose(matches, agree) + log_choose(agree, 5)
+    return bool(np.log(tests) + ways + (agree - 5) * np.log(min(chance, 1.0)) < 0)
 
 
 def _chance(camera: pycolmap.Camera, threshold: float) -> float:

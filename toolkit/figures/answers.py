@@ -106,9 +106,9 @@ class Answer:
 
     @cached_property
     def numbers(self) -> dict[str, float]:
-        """The known ones of `LABELS`; lengths in `unit`."""
+        """The known ones of `LABELS`; lengths in `unit`, and named by it."""
         numbers = {name: float(getattr(self.result, name)) for name in LABELS}
-        numbers["position_std_m"] /= self.unit[1]
+        numbers[f"position_std_{self.unit[0]}"] = numbers.pop("position_std_m") / self.unit[1]
         return {name: value for name, value in numbers.items() if np.isfinite(value)}
 
     @property
@@ -127,8 +127,9 @@ class Answer:
             hidden.add("agreement")
         texts = {"method": self.result.found_by}
         for name, (label, form) in (LABELS | OF_NETWORKS if by_network else LABELS).items():
-            if name in numbers and name not in hidden:
-                texts[label.format(unit=unit)] = form.format(numbers[name])
+            value = numbers.get(f"position_std_{unit}" if name == "position_std_m" else name)
+            if value is not None and name not in hidden:
+                texts[label.format(unit=unit)] = form.format(value)
         if self.error is not None:
             texts[f"true position error [{unit}]"] = _digits(self.error[1])
             texts["true rotation error [deg]"] = _digits(self.error[0])
@@ -308,9 +309,9 @@ def _support(numbers: Mapping[str, float], method: str) -> list[str]:
 def draw_answers(answers: Sequence[Answer], title: str) -> "Figure":
     """Draw a query, localized once or twice: beside its best reference, in the map from above, and in numbers.
 
-    Lines join the points that the query and its best reference both see. Inliers are colored by how they were found
-    (`query_images.WAYS`), rejected matches are red; markers tell the kind of features. A single answer also has its
-    further references.
+    Lines join the points that the query and its best reference both see. Those that agree are colored by how they
+    were found (`query_images.WAYS`), rejected matches are red; markers tell the kind of features. A single answer also
+    has its further references.
     """
     several = len(answers) > 1
     heights = [3.3, 3.6] if several else [4.0, 2.0, 3.6]
@@ -342,7 +343,7 @@ def _caption(details: QueryDetails) -> str:
     """Return what the drawn image and its best reference see."""
     camera, references = details.cameras[0], details.captioned_references()
     of_rig = f" ({Path(camera.name).parent.name})" if len(details.cameras) > 1 else ""
-    counts = f"{camera.num_inliers} of {len(camera.matches)} map points agree"
+    counts = f"{camera.num_agreeing} of {len(camera.matches)} map points agree"
     text = f"query{of_rig}: {counts if len(camera.matches) else 'no matches were stored'}"
     if not references:
         return f"{text} · no reference"
@@ -355,7 +356,7 @@ def _draw_further(figure: "SubFigure", details: QueryDetails) -> None:
     """Draw the references but the best, and the further cameras of a rig."""
     images = details.captioned_references()[1:]
     for image in details.cameras[1:]:
-        count = f": {image.num_inliers} points agree" if details.has_matches else ""
+        count = f": {image.num_agreeing} points agree" if details.has_matches else ""
         images.append((image, f"query, {Path(image.name).parent.name}{count}", True))
     panels = figure.subplots(1, max(4, min(6, len(images))), squeeze=False)[0]
     for panel in panels:

@@ -16,6 +16,7 @@ from toolkit.results.metrics import (
     WRONG,
     Threshold,
     is_below,
+    named_as_meters,
     small_unit,
     threshold_name,
     threshold_text,
@@ -50,7 +51,7 @@ class Evaluation:
     messages: list[str] = field(default_factory=list)
     """What was not evaluated, and why."""
     unit: str = "m"
-    """Unit of lengths: m, or `metrics.UNKNOWN_UNIT`."""
+    """Unit of lengths: `m`, `metrics.UNKNOWN_UNIT`, or `m or L` if the unit of some maps is unknown."""
     sequences: pd.DataFrame = field(default_factory=pd.DataFrame)
     """One row per pair and step of the sequence stage: recall, medians, queries rescued and broken."""
     changes: pd.DataFrame = field(default_factory=pd.DataFrame)
@@ -69,11 +70,12 @@ class Evaluation:
 def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
     """Return the figures of an evaluation by name, except figures without data."""
     figures: dict[str, Figure] = {}
-    done, errors, unit = evaluation.recall, evaluation.errors, evaluation.unit
+    done, errors, retrieval = map(named_as_meters, (evaluation.recall, evaluation.errors, evaluation.retrieval))
+    unit = evaluation.unit
     done = done.dropna(subset=["localized"]) if "localized" in done else done.iloc[:0]
     if len(done):
         small, factor = small_unit(unit)
-        names = [f"recall@{threshold_name(t, unit)}" for t in evaluation.thresholds]
+        names = [name for name in done if name.startswith("recall@")]
         columns = [(name, f"recall @ {threshold_text(name)}", 100.0, "%") for name in names]
         figures["recall"] = draw_matrices(done, columns, "Share of queries localized within the threshold")
         medians = [("median_rotation_deg", "median rotation error", 1.0, "°"),
@@ -89,8 +91,8 @@ def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
             figures["losses"] = draw_losses(evaluation.losses)
     if len(evaluation.sequences):
         figures["sequence"] = draw_steps(evaluation.sequences)
-    if ks := [name for name in evaluation.retrieval if name.startswith("recall@")]:
-        done = evaluation.retrieval.dropna(subset=ks)
+    if ks := [name for name in retrieval if name.startswith("recall@")]:
+        done = retrieval.dropna(subset=ks)
         reach = f"{done['radius_m'].iloc[0]:g} {unit} and {done['angle_deg'].iloc[0]:g}°"
         columns = [(k, f"in the first {k.removeprefix('recall@')}", 100.0, "%") for k in ks]
         columns.append(("in_map", "anywhere in the map", 100.0, "%"))

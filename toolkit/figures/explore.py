@@ -133,7 +133,7 @@ def draw_top_view(
     if not layers:
         return _empty("no session with poses can be used")
     everything = np.concatenate([layer.at for layer in layers])
-    ground = Ground.below(everything, up, (capture.unit if unit == "auto" else unit, 1.0))
+    ground = Ground.below(everything, up, (capture.unit_of(unit), 1.0))
     points = np.zeros((0, 3)) if points is None else points
     tint = "#9A9A9A" if colors is None else np.clip(colors / 255 * 0.75 + 0.2, 0, 0.75)
     layers.insert(0, Layer(points, None, tint, s=1.2, lw=0, rasterized=True))

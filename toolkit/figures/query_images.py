@@ -217,7 +217,7 @@ def draw_localization(query: QueryDetails, title: str = "", unit: tuple[str, flo
     if not located:
         caption = "query: not localized" + (f", {len(good)} matches" if len(good) else "")
     elif query.has_matches:
-        caption = f"query: {shown.num_inliers} of {len(good)} map points agree"
+        caption = f"query: {shown.num_agreeing} of {len(good)} map points agree"
     else:
         caption = "query: no matches, the pose comes from the references"
     draw_image(axis, shown, 4.4, caption, frame=GREEN if located else ESTIMATED)

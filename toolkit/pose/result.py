@@ -72,7 +72,7 @@ class Correspondences:
     point_index: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     """(K,) index of the map point, counted through all maps in order; -1 for a point lifted by depth."""
     inlier: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
-    """(K,) whether it is an inlier of the pose."""
+    """(K,) whether it agrees with the pose; `num_inliers` counts only those found by descriptors alone."""
     found_by: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, "U1"))
     """(K,) `<kind of features>/<descriptors, guided or lifted>`."""
     view_of: Ints = field(default_factory=lambda: np.zeros(0, np.int64))

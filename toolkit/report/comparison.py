@@ -24,7 +24,7 @@ from toolkit.files import SceneFiles, require_current, require_whole
 from toolkit.geometry import Floats, Ints
 from toolkit.report.page import off_by, read_run, seconds_text
 from toolkit.results.localized import LocalizedPair
-from toolkit.results.metrics import is_below, named_as_meters, parse_threshold, threshold_text, unit_of
+from toolkit.results.metrics import is_below, named_as_meters, named_by_unit, parse_threshold, threshold_text, unit_of
 from toolkit.results.opening import SESSIONS_ROOT, how_localized
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class Comparison:
     """Names, such as `(1deg,0.1m)`."""
     queries: pd.DataFrame
     """One row per common query and pair. Columns `QUERY`; `image`, the image name; `status_<i>`,
-    `rotation_error_deg_<i>` and `translation_error_m_<i>` of each run i."""
+    `rotation_error_deg_<i>` and `translation_error_m_<i>` of each run i, or `_L_<i>` if the unit is unknown."""
     recall: pd.DataFrame
     """One row per pair, threshold and run, and the same for all pairs together: recall and its difference to the first
     run (0 to 1), each with the `_low` and `_high` of its interval; numbers of queries, won and lost."""
@@ -131,11 +131,12 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
     names = [f"{name} ({i})" if names.count(name) > 1 else name for i, name in enumerate(names, 1)]
     limits = [[name.removeprefix("loss@") for name in table if name.startswith("loss@")] for table in tables]
     keys = [*QUERY, *(["sensor_id"] if all("sensor_id" in table for table in tables) else [])]
+    unit = unit_of(*limits[0])
     for folder, record, table, limit in zip(folders, records, tables, limits, strict=True):
-        if unit_of(*limit) != unit_of(*limits[0]):
+        if unit_of(*limit) != unit:
             raise ArtifactError(
-                f"{folder}: found errors in {unit_of(*limit)}, expected {unit_of(*limits[0])} as in {folders[0]}. Set "
-                "the same `unit` for both, and run them again."
+                f"{folder}: found errors in {unit_of(*limit)}, expected {unit} as in {folders[0]}. Set the same `unit` "
+                "for both, and run them again."
             )
         if table.duplicated(keys).any():
             raise ArtifactError(
@@ -163,9 +164,9 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
     for i, k in np.ndindex(hits.shape[1:]):
         turned, moved = queries[[f"{name}_{i}" for name in _ERRORS]].to_numpy(float).T
         hits[:, i, k] = is_below(turned, moved, parse_threshold(limits[0][k]))
+    recall, queries = _recall(queries, hits, names, limits[0], seed, resamples), named_by_unit(queries, unit)
     return Comparison(
-        *(folders, names, records, limits[0], queries),
-        _recall(queries, hits, names, limits[0], seed, resamples),
+        *(folders, names, records, limits[0], queries, recall),
         _changes(queries, hits, names, limits[0]),
         _settings({name: record["manifest"] for name, record in zip(names, records, strict=True)}),
         _resources({name: record["stages"] for name, record in zip(names, records, strict=True)}),

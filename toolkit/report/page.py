@@ -26,6 +26,7 @@ from toolkit.files import (
     read_json,
     read_map_record,
     sidecar_path,
+    write_sidecar,
     write_text,
 )
 from toolkit.pose.result import Status, status_counts, statuses
@@ -74,7 +75,7 @@ EVALUATION_FIGURES = {
     ),
     "deviations": (
         "Stated and actual deviation",
-        "Position error of each pose against its stated standard deviation (position_std in poses/*.csv). With 30 "
+        "Position error of each pose against its stated standard deviation ({column} in poses/*.csv). With 30 "
         "poses or more, a line joins the median of each tenth. Poses above the dashed line are off by more than five "
         "deviations.",
     ),
@@ -131,8 +132,11 @@ def write_report(run_dir: str | Path) -> Path:
         parameters=[(_stage_name(row), _json(row["parameters"])) for row in run["stages"] if row.get("parameters")],
         left_out=left_out,
     )
-    write_text(run_dir / "report.html", page)
-    return run_dir / "report.html"
+    path = run_dir / "report.html"
+    write_text(path, page)
+    shown = [*run_dir.glob("*/evaluation/*.csv"), *run_dir.glob("*/poses/*.csv"), run_dir / "run.json"]
+    write_sidecar(path, {}, made_from=sorted(shown))
+    return path
 
 
 def read_run(path: Path) -> dict[str, Any]:
@@ -244,7 +248,7 @@ def _scene(files: SceneFiles, run: Mapping[str, Any], album: "Album") -> dict[st
         lengths += [f"{metrics.length_unit(record)[1]:.3g} in {path.stem}"] if record["depth"] else []
     if unit != "m":
         depth = f"a tenth of the median scene depth of a map{': ' if lengths else ''}{', '.join(lengths)}"
-        remarks.append(f"The unit of the poses is not known: {unit} is {depth}.")
+        remarks.append(f"The unit of the poses is not known: {metrics.UNKNOWN_UNIT} is {depth}.")
     verdict, headlines = _verdict(recall, errors, queries, thresholds)
     found, note = _retrieval(retrieval, headlines, unit)
     table, links = _main_table(files, recall, queries, thresholds)
@@ -253,7 +257,11 @@ def _scene(files: SceneFiles, run: Mapping[str, Any], album: "Album") -> dict[st
     samples = [path for path in stills if path.name.startswith("localization")]
     recordings = [path for path in stills if of_sequence(path.name)]
     maps = [path for path in stills if path not in (*worst, *samples, *recordings)]
-    figures = {files.evaluation / f"{name}.png": texts for name, texts in EVALUATION_FIGURES.items()}
+    column = "position_std_m" if unit == "m" else "position_std"
+    figures = {
+        files.evaluation / f"{name}.png": (title, text.format(column=column))
+        for name, (title, text) in EVALUATION_FIGURES.items()
+    }
     return {
         "name": files.scene,
         "fingerprint": str(run["inputs"].get(files.scene, "")),
@@ -622,7 +630,8 @@ def _length(length: float, unit: str) -> str:
 
 def off_by(row: Mapping[Any, Any], before: str = "", after: str = "", *, unit: str) -> str:
     """Return the errors of a query as text; `before` and `after` complete the names of their columns."""
-    angle, length = (row[f"{before}{name}{after}"] for name in ("rotation_error_deg", "translation_error_m"))
+    of_length = (name for name in row if name.startswith(f"{before}translation_error") and name.endswith(after))
+    angle, length = row[f"{before}rotation_error_deg{after}"], row[next(of_length)]
     return f"{number(angle)}°, {_length(length, unit)}" if math.isfinite(angle) else "no pose"
 
 

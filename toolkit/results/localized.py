@@ -63,7 +63,8 @@ class ShownImage:
     """(n,) how each correspondence was found, such as `sift/guided`."""
 
     @property
-    def num_inliers(self) -> int:
+    def num_agreeing(self) -> int:
+        """Number of correspondences that agree with the pose, guided ones too; not that of inliers."""
         return int(self.inlier.sum())
 
     @property
@@ -125,7 +126,7 @@ class QueryDetails:
     def captioned_references(self) -> list[tuple[ShownImage, str, bool]]:
         """Return at most `REFERENCES` references, up to two of them rejected: image, caption, whether used."""
         agree = [
-            (image, f"reference {rank}" + (f": sees {image.num_inliers} points" if self.has_matches else ""), True)
+            (image, f"reference {rank}" + (f": sees {image.num_agreeing} points" if self.has_matches else ""), True)
             for rank, image in enumerate(self.references, start=1)
         ]
         rejected = [(image, "rejected: contradicts the others", False) for image in self.rejected]
@@ -252,7 +253,7 @@ def query_details(
         matches = np.flatnonzero(found.camera == number)
         of_image = view.name, view.image, view.camera, pose @ rig_from_cam
         cameras.append((_shown(*of_image, result, matches, found.pixels[matches], true @ rig_from_cam), rig_from_cam))
-    cameras.sort(key=lambda camera: -camera[0].num_inliers)
+    cameras.sort(key=lambda camera: -camera[0].num_agreeing)
     used = _references(map_session, result, {name: number for number, name in enumerate(result.references)})
     rejected = _references(map_session, result, dict.fromkeys(result.rejected, -1))
     return QueryDetails([image for image, _ in cameras], used, rejected, result, cameras[0][1])

@@ -45,18 +45,26 @@ def length_unit(record: Mapping[str, Any]) -> tuple[str, float]:
 
 
 def unit_of(*thresholds: str) -> str:
-    """Return the unit of thresholds from their names or column names; without names, the meter."""
-    return UNKNOWN_UNIT if any(name.endswith(f"{UNKNOWN_UNIT})") for name in thresholds) else "m"
+    """Return the unit of thresholds from their names or column names: `m`, also without names, `L`, or `m or L`."""
+    ends = (("m", "m)"), (UNKNOWN_UNIT, f"{UNKNOWN_UNIT})"))
+    return " or ".join(unit for unit, end in ends if any(name.endswith(end) for name in thresholds)) or "m"
 
 
 def named_by_unit(table: pd.DataFrame, unit: str) -> pd.DataFrame:
-    """Return a table whose columns of lengths say their unit: `translation_error_L`, not `translation_error_m`."""
-    return table if unit == "m" else table.rename(columns=lambda name: re.sub(r"_m$", f"_{unit}", name))
+    """Return a table whose columns of lengths say their unit: `translation_error_L`, not `translation_error_m`.
+
+    A table of pairs with different units has a column for each; a length of all of them has no unit in its name.
+    """
+    end = f"_{unit}" if unit in ("m", UNKNOWN_UNIT) else ""
+    return table.rename(columns=lambda name: re.sub(r"_m(_\d+)?$", rf"{end}\1", name))
 
 
 def named_as_meters(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table that `named_by_unit` has named, with the names that the toolkit computes with."""
-    return table.rename(columns=lambda name: re.sub(f"_{UNKNOWN_UNIT}$", "_m", name))
+    """Return a table that `named_by_unit` has named with one column for each length, as the toolkit computes."""
+    others = {name: re.sub(f"_{UNKNOWN_UNIT}$", "_m", name) for name in table if name.endswith(f"_{UNKNOWN_UNIT}")}
+    both = {name: meters for name, meters in others.items() if meters in table}
+    joined = {meters: table[meters].fillna(table[name]) for name, meters in both.items()}
+    return table.assign(**joined).drop(columns=[*both]).rename(columns=others)
 
 
 def small_unit(unit: str) -> tuple[str, float]:
@@ -145,9 +153,10 @@ def worst_first(queries: pd.DataFrame, threshold: Threshold = THRESHOLDS[0]) -> 
 
     Args:
         queries: one row per query. Column `status`; and, NaN or absent if unknown, `rotation_error_deg`,
-            `translation_error_m`, `num_inliers` and `position_std_m`.
-        threshold: degrees and meters that are equally bad.
+            `translation_error_m`, `num_inliers` and `position_std_m`, or these lengths in `_L`.
+        threshold: degrees and length that are equally bad.
     """
+    queries = named_as_meters(queries)
 
     def column(name: str, unknown: float) -> Floats:
         values: Any = queries[name] if name in queries else np.full(len(queries), np.nan)
@@ -163,14 +172,14 @@ def worst_first(queries: pd.DataFrame, threshold: Threshold = THRESHOLDS[0]) -> 
 
 
 def summary_of(
-    rotation_deg: Floats, translation_m: Floats, thresholds: Sequence[Threshold], unit: str
+    rotation_deg: Floats, translation: Floats, thresholds: Sequence[Threshold], unit: str
 ) -> dict[str, float]:
     """Return recall at each threshold, `recall@<name>`, and the medians of both errors, all queries counted."""
-    shares = recall(rotation_deg, translation_m, thresholds)
+    shares = recall(rotation_deg, translation, thresholds)
     return {
         **{f"recall@{threshold_name(t, unit)}": share for t, share in zip(thresholds, shares, strict=True)},
         "median_rotation_deg": float(np.median(rotation_deg)),
-        "median_translation_m": float(np.median(translation_m)),
+        f"median_translation_{unit}": float(np.median(translation)),
     }
 
 

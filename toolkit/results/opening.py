@@ -12,6 +12,7 @@ import h5py
 from toolkit.capture import Capture, Session
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.features.matching import LocalMethod
+from toolkit.features.stores import FeatureStore
 from toolkit.files import SceneFiles, file_fingerprint, fingerprint, pair_devices, write_atomic
 from toolkit.manifest import LocalizeSettings, Settings, nearest
 from toolkit.mapping.local_map import map_path
@@ -136,6 +137,15 @@ def session_fingerprint(session: Session) -> str:
     """Return 16 hex digits that identify the calibration, poses and image list of a session."""
     files = ["sensors.txt", "images.txt", "rigs.txt", "trajectories.txt"]
     return fingerprint([file_fingerprint(session.path / name) for name in files if (session.path / name).exists()])
+
+
+def map_inputs(session: Session, features: FeatureStore) -> str:
+    """Return 16 hex digits that identify what a map is made of, `inputs` of its record: its session and features.
+
+    Args:
+        features: features of images of other sessions are ignored.
+    """
+    return fingerprint([session_fingerprint(session), features.only(session.image_names).fingerprint])
 
 
 def attributes(

@@ -33,7 +33,7 @@ from toolkit.files import (
 from toolkit.geometry import Floats
 from toolkit.mapping.local_map import LocalMap
 from toolkit.pose.result import QueryResult, Status
-from toolkit.results.metrics import is_posed, length_unit, pose_errors
+from toolkit.results.metrics import is_posed, length_unit, named_by_unit, pose_errors
 from toolkit.store.hdf5 import HDF5_ERRORS, has_group, read_group
 
 MAPS = "maps"
@@ -164,18 +164,18 @@ class PairResults:
             ) from None
 
     def errors(self, truth: Trajectory | Floats) -> pd.DataFrame:
-        """Return the table with `rotation_error_deg` and `translation_error_m`, by `metrics.pose_errors`.
+        """Return the table with `rotation_error_deg` and `translation_error_m`, by `metrics.pose_errors`; or `_L`.
 
         Args:
             truth: true world_from_rig: a trajectory, or (Q, 4, 4).
 
-        Errors are infinite without a pose and NaN without a true pose. Lengths, `position_std_m` too, are in `unit`.
+        Errors are infinite without a pose and NaN without a true pose. Lengths are in `unit`, and named by it.
         """
         keys = self.table[["timestamp", "device_id"]]
         rotation_deg, translation = pose_errors(self.poses, truth, keys) if len(self) else (np.zeros(0), np.zeros(0))
         table = self.table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation)
         lengths = table.columns.intersection(["translation_error_m", "position_std_m"])
-        return table.assign(**table[lengths] / self.unit[1])
+        return named_by_unit(table.assign(**table[lengths] / self.unit[1]), self.unit[0])
 
     def require_current(self, *endings: str) -> None:
         """Raise ArtifactError if the poses were made from other files than those that are there now."""

@@ -19,7 +19,7 @@ _NO_RESULT = {"name", "output_root", "tolerate_failed", "description"}
 """Keys of a manifest that change no result."""
 _LONGEST = 100
 """Longest name of a run folder, letters; a longer one ends in a fingerprint."""
-_TAKEN = ("embed", "retrieve", "rerank", "localize", "sequence")
+TAKEN = ("embed", "retrieve", "rerank", "localize", "sequence")
 """Stages whose results a run takes over, in order."""
 
 
@@ -114,19 +114,19 @@ def take_over(donors: Sequence[Path], own: Manifest) -> None:
         if donor is None or mine.root.exists():
             continue
         theirs = SceneFiles(donor, scene)
-        made = {theirs.of_stage(stage) for stage in _TAKEN[: shared[donor]]}
-        for source in {theirs.features, theirs.maps, theirs.index} | made:
+        made = {theirs.of_stage(stage) for stage in TAKEN[: shared[donor]]}
+        for source in {*theirs.caches} | made:
             if source is not None and source.is_dir():
                 link_folder(source, mine.root / source.name)
 
 
 def _shared_stages(donor: Path, own: Manifest) -> int:
-    """Return how many stages of `_TAKEN`, from the first on, have the same settings in the record of a run."""
+    """Return how many stages of `TAKEN`, from the first on, have the same settings in the record of a run."""
     try:
         theirs = Manifest.of(read_json(donor / RECORD).get("manifest"))
     except ManifestError:  # without a record, or of an older version
         return 0
     if any(getattr(theirs, key) != getattr(own, key) for key in ("queries", "devices", "pairs", "extra_devices")):
         return 0
-    before, after = ([one.stage(stage) if stage in one.stages else None for stage in _TAKEN] for one in (theirs, own))
+    before, after = ([one.stage(stage) if stage in one.stages else None for stage in TAKEN] for one in (theirs, own))
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(before, after, strict=True)))

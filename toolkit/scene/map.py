@@ -30,7 +30,7 @@ from toolkit.features.matching import (
     weights_files,
 )
 from toolkit.features.stores import FeatureStore, OnDemandFeatures, extract_session
-from toolkit.files import SceneFiles, fingerprint, require_current
+from toolkit.files import SceneFiles, require_current
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import LocalizeSettings
 from toolkit.manifest.settings import expand
@@ -65,8 +65,8 @@ from toolkit.results.opening import (
     Localized,
     how_localized,
     last_localized,
+    map_inputs,
     pairs_in_map,
-    session_fingerprint,
 )  # fmt: skip
 from toolkit.results.pair import find_query
 from toolkit.scene.located import Located, Retrieved, ranks, show_matches
@@ -141,7 +141,7 @@ class Map:
             assert self.features_dir is not None
             turns = built.turns_of(kind, session)
             store = extract_session(session, self.features_dir, kind.extractor, workers=workers, turns=turns)
-            inputs = fingerprint([session_fingerprint(session), store.fingerprint])
+            inputs = map_inputs(session, store)
             local_map = build_map(
                 session, store, map_path(self.map_dir, session.id, kind.name), settings.map, settings.seed,
                 skip_existing, inputs, workers, settings.unit is not None, built.refined_poses or None,
@@ -192,10 +192,12 @@ class Map:
     def _stored_in(cls, device: str, localized: Localized, features_dir: Path, map_dir: Path) -> "Map":
         settings, h5_attributes, names = localized
         (kinds, escalation), mapped = create_methods(settings), list[MappedFeatures]()
+        root = Path(h5_attributes[SESSIONS_ROOT])
         for name, kind in zip(names, kinds if settings.map is not None else (), strict=True):
             store = FeatureStore.of_session(features_dir, f"{device}_map", kind.extractor.settings)
+            session = Capture.from_sessions_root(root)[f"{device}_map"]
+            require_current(map_dir / name, "localize", inputs=map_inputs(session, store))
             mapped.append(MappedFeatures(LocalMap.load(map_dir / name), store, kind.name, kind.matcher))
-        root = Path(h5_attributes[SESSIONS_ROOT])
         return cls(device, root, map_dir, settings, kinds, mapped, escalation, features_dir)
 
     @cached_property

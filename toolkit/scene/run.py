@@ -11,7 +11,7 @@ import pandas as pd
 from toolkit.capture import Capture, Session
 from toolkit.capture.devices import in_order
 from toolkit.errors import ArtifactError
-from toolkit.files import SceneFiles, pair_devices, read_json, relative_url
+from toolkit.files import SceneFiles, pair_devices, read_json, relative_url, why_older
 from toolkit.geometry import Ints
 from toolkit.pose.base import Query
 from toolkit.pose.result import QueryResult, statuses
@@ -31,6 +31,9 @@ class Page:
     def of(cls, path: Path) -> "Page":
         if not path.is_file():
             raise ArtifactError.at(path, "no such page", do="Finish the run: python -m toolkit run MANIFEST.")
+        if older := why_older(path, "report"):
+            found = older.partition(":")[0]
+            raise ArtifactError.at(path, found, do=f"Write it again: python -m toolkit report {path.parent}.")
         return cls(path)
 
     def _repr_html_(self) -> str:
@@ -140,7 +143,7 @@ class Run:
         """Return a link to the report, as a notebook shows it.
 
         Raises:
-            ArtifactError: the run has no report.
+            ArtifactError: the run has no report, or results have changed since it was written.
         """
         return Page.of(self.path / "report.html")
 

@@ -106,13 +106,13 @@ class ReferenceSearch:
         return [(of_image[:k], scores[:k]) for of_image, scores in ranked]
 
     def _rerank(self, ranked: Ranked, view: View) -> Ranked:
-        """Return rows of map images and their inlier counts, most inliers first, as the rerank stage does."""
+        """Return rows of map images and their numbers of verified matches, most first, as the rerank stage does."""
         method, verifier = self._verification
         rows = ranked[0][: verifier.settings.topn]
         names = [self.session.image_name(int(row)) for row in rows]
-        inliers, _ = verifier.verify(view.extract(method), view.camera, names, self.session.cameras(rows))
-        order = np.argsort(-np.array(inliers), kind="stable")[: verifier.settings.topk]
-        return rows[order], np.array(inliers, np.float64)[order]
+        verified, _ = verifier.verify(view.extract(method), view.camera, names, self.session.cameras(rows))
+        order = np.argsort(-np.array(verified), kind="stable")[: verifier.settings.topk]
+        return rows[order], np.array(verified, np.float64)[order]
 
     def _as_searched(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return descriptors normalized and rounded like those of the map, which were written to a file."""

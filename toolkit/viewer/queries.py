@@ -19,7 +19,7 @@ from toolkit.figures.scene_3d import pyramids
 from toolkit.figures.style import ESTIMATED, GREEN, MAP, ORANGE, SKY, TRUE, draw_error_legend, error_colors
 from toolkit.geometry import Floats, local_origin, project, rotation_to_quaternion, shifted
 from toolkit.results.localized import REFERENCES, Localizations, QueryDetails, ShownImage, support_of
-from toolkit.results.metrics import is_posed
+from toolkit.results.metrics import is_posed, named_as_meters
 from toolkit.viewer import blueprint as viewer
 
 logger = logging.getLogger(__name__)
@@ -122,7 +122,7 @@ def _log_map_cameras(stream: rr.RecordingStream, poses: Floats, size: float) -> 
 def _log_overview(stream: rr.RecordingStream, queries: Localizations, shift: Floats) -> None:
     """Log all queries: estimates and error lines colored by error, true positions, failures at their references."""
     located, has_truth = is_posed(queries.estimated), is_posed(queries.true)
-    colors = error_colors(queries.errors["translation_error_m"])
+    colors = error_colors(named_as_meters(queries.errors)["translation_error_m"])
     labels = np.array([f"#{k} {describe(queries, k)}" for k in range(len(queries.names))], object)
 
     def dots(path: str, rows: NDArray[np.bool_], centers: Floats, color: Any, radius: float) -> None:
@@ -266,7 +266,7 @@ def _jpeg_of(path: Path) -> tuple[bytes, tuple[int, int]]:
 
 def describe(queries: Localizations, k: int) -> str:
     """Return one line of text about a query: name, status, errors, inliers."""
-    row = queries.errors.iloc[k]
+    row = named_as_meters(queries.errors.iloc[[k]]).iloc[0]
     parts = [str(queries.names[k]), str(row["status"])]
     if np.isfinite(row["translation_error_m"]):
         parts.append(f"off by {row['rotation_error_deg']:.2g}°, {row['translation_error_m']:.3g} {queries.unit[0]}")
