@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import click
 import numpy as np
 import pytest
 import typer
@@ -230,9 +229,9 @@ def test_commands_exist_with_their_options() -> None:
     assert len(calls) > 20
     for call in calls:
         command, words = main, call[call.index("toolkit") + 1 :]
-        while isinstance(command, click.Group):
-            assert words[0] in command.commands, call
-            command, words = command.commands[words[0]], words[1:]
+        while commands := getattr(command, "commands", None):  # a group; newer versions of typer have their own class
+            assert words[0] in commands, call
+            command, words = commands[words[0]], words[1:]
         command.make_context(command.name, words)  # raises for unknown options and missing arguments
 
 
