@@ -110,7 +110,7 @@ def test_a_transforms_json_is_taken_as_a_table(tmp_path: Path) -> None:
         import_once(tmp_path, place, "ios", "query", table=file)
     with pytest.raises(ManifestError, match="poses_are: found 'cam_from_world', expected world_from_cam"):
         import_once(images, place, "ios", "query", table=file, poses_are="cam_from_world")
-    with pytest.raises(CaptureError, match=r"not a CSV table. .* python -m toolkit import transforms"):
+    with pytest.raises(CaptureError, match=r"not a CSV table. .* visloc import transforms"):
         import_images(images, place, "ios", "query", table=file)
     with pytest.raises(CaptureError, match=r"A map needs poses: .*, or import a transforms.json or a COLMAP model"):
         import_images(images, place, "hl", "map")

@@ -21,6 +21,8 @@ try:
 
     from toolkit import __version__
     from toolkit.errors import (
+        COMMAND,
+        COMMAND_VARIABLE,
         ArtifactError,
         IncompleteError,
         ManifestError,
@@ -158,7 +160,7 @@ def run(
         raise
     tell(f"Report: {run_dir / 'report.html'}")
     if only == pipeline.MAP:
-        tell(f"Localize a photograph: python -m toolkit localize {run_dir} PHOTOGRAPH")
+        tell(f"Localize a photograph: {COMMAND} localize {run_dir} PHOTOGRAPH")
     result = summary(run_dir)
     if as_json:
         _print_json(result)
@@ -309,7 +311,7 @@ def new(
     from toolkit.exchange.new_manifest import new_manifest
 
     path = new_manifest(name, capture, out)
-    print(f"Manifest: {path}\nRun it: python -m toolkit run {path}")
+    print(f"Manifest: {path}\nRun it: {COMMAND} run {path}")
 
 
 @app.command()
@@ -598,10 +600,10 @@ def reconstruct(
     run_dir = pipeline.run(manifest, None if hold_out else pipeline.MAP, say=tell)
     if hold_out:
         tell(f"Report: {run_dir / 'report.html'}")
-    tell(f"Localize a photograph: python -m toolkit localize {run_dir} PHOTOGRAPH --picture above.png")
+    tell(f"Localize a photograph: {COMMAND} localize {run_dir} PHOTOGRAPH --picture above.png")
     if not hold_out:
-        tell(f"Or many: python -m toolkit import images QUERIES {capture} --device {device}{option}, and then")
-        tell(f"python -m toolkit run {manifest}")
+        tell(f"Or many: {COMMAND} import images QUERIES {capture} --device {device}{option}, and then")
+        tell(f"{COMMAND} run {manifest}")
 
 
 @export_app.command("colmap")
@@ -813,6 +815,7 @@ def main() -> None:
     if not sys.stderr.isatty():
         os.environ.setdefault("TQDM_MININTERVAL", "30")  # seconds between lines about progress in a log
 
+    os.environ[COMMAND_VARIABLE] = COMMAND
     received: list[int] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -823,7 +826,7 @@ def main() -> None:
         if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) == signal.SIG_DFL:
             signal.signal(getattr(signal, name), stop)
     try:
-        app(prog_name="visloc" if Path(sys.argv[0]).stem == "visloc" else "python -m toolkit")
+        app(prog_name=COMMAND)
     except SystemExit as end:  # typer has printed the message
         if end.code != INTERRUPTED:
             raise SystemExit(1 if end.code == USAGE else end.code) from None

@@ -234,7 +234,7 @@ def damage(kind: str, run: Path) -> None:
         ("no run", r"No run at .*b: run\.json is missing"),
         ("torn record", r"run\.json is not valid JSON"),
         ("odd record", r"run\.json: 'stages' is not as a run writes it"),
-        ("not evaluated", r"b: not evaluated .*errors\.csv is missing.*python -m toolkit run"),
+        ("not evaluated", r"b: not evaluated .*errors\.csv is missing.*visloc run"),
         ("torn table", r"errors\.csv.*Run the stage"),
         ("no truth", r"b: found no query with ground truth.*evaluate again"),
         ("no column", r"errors\.csv: column 'status' is missing"),

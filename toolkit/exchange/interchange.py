@@ -22,7 +22,7 @@ from toolkit.capture import parse_camera
 from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.images import decode, exif_camera
 from toolkit.capture.tables import POSE_NAMES
-from toolkit.errors import CaptureError, ImageError, ManifestError
+from toolkit.errors import COMMAND, CaptureError, ImageError, ManifestError
 from toolkit.exchange.colmap_model import (
     NORM_TOLERANCE,
     inverse,
@@ -402,7 +402,7 @@ def _read_table(path: Path) -> pd.DataFrame:
     With poses, column `problem` says why the pose of a row is none.
     """
     if _is_transforms(path):
-        raise CaptureError(f"{path}: not a CSV table. Import it by python -m toolkit import transforms.")
+        raise CaptureError(f"{path}: not a CSV table. Import it by {COMMAND} import transforms.")
     text = read_text(path)
     first = next((line for line in text.splitlines() if line.strip()), "").split()
     of_hloc = len(first) > 4 and first[1] in pycolmap.CameraModelId.__members__

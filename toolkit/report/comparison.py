@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from toolkit.capture import Capture
 from toolkit.capture.devices import extra_devices
 from toolkit.capture.names import allow_outside
-from toolkit.errors import ArtifactError, ToolkitError
+from toolkit.errors import COMMAND, ArtifactError, ToolkitError
 from toolkit.figures.query_images import draw_localization
 from toolkit.figures.style import BLUE, GREEN, ORANGE, SKY, VERMILLION, new_figure, number, percent, styled
 from toolkit.files import SceneFiles, require_current, require_whole
@@ -221,7 +221,7 @@ def _read_errors(folder: Path, record: Mapping[str, Any]) -> pd.DataFrame:
         tables.append(table.assign(scene=scene))
     if not tables:
         missing = f"{next(iter(paths.values()))} is missing" if paths else "its run.json names no scene"
-        raise ArtifactError(f"{folder}: not evaluated ({missing}). Finish the run: python -m toolkit run MANIFEST.")
+        raise ArtifactError(f"{folder}: not evaluated ({missing}). Finish the run: {COMMAND} run MANIFEST.")
     errors = pd.concat(tables, ignore_index=True).dropna(subset=_ERRORS)
     if errors.empty:
         raise ArtifactError(

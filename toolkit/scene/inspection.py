@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from toolkit.capture import Capture
-from toolkit.errors import OF_THE_DATA, ArtifactError, ToolkitError
+from toolkit.errors import COMMAND, OF_THE_DATA, ArtifactError, ToolkitError
 from toolkit.figures.answers import Answer
 from toolkit.figures.query_images import shown_name
 from toolkit.files import SceneFiles, image_name, pair_devices, read_references, require_current
@@ -63,7 +63,7 @@ class InspectedPair:
             raise ArtifactError(
                 f"{poses_dir}: no correspondences of queries of {query_device!r} in the map of {map_device!r}, "
                 f"`<pair>.h5`. {nearest(f'{query_device} in {map_device}', known)} Localize first: "
-                "python -m toolkit run MANIFEST."
+                f"{COMMAND} run MANIFEST."
             )
         self.map_device, self.label = map_device, f"{query_device} in the map of {map_device}"
         self._h5 = pairs[map_device, query_device]
