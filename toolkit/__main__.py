@@ -504,6 +504,7 @@ def import_transforms(
 
 @importer("dataset")
 def import_dataset(
+    context: typer.Context,
     kind: Annotated[str, Argument(metavar="KIND", help=_KINDS)],
     path: Annotated[Path, Argument(help="Folder of the data set as published, or of one of its scenes.")],
     capture: Annotated[Path, Argument(help="New capture folder, with a map and a query session.")],
@@ -515,18 +516,30 @@ def import_dataset(
     """Make a map and queries from a data set of the field, and a manifest with its thresholds."""
     from toolkit.exchange.datasets import LAYOUTS, import_dataset
     from toolkit.exchange.new_manifest import new_manifest
+    from toolkit.manifest import nearest
     from toolkit.synthetic.photographs import KINDS, SCENES, THRESHOLDS, arrange
 
+    if kind not in {*LAYOUTS, *KINDS}:
+        raise ManifestError.at("KIND", repr(kind), do=nearest(kind, [*LAYOUTS, *KINDS]))
     manifest, report, thresholds = _manifest_of(capture), None, THRESHOLDS
     if kind in KINDS:
+        _refuse_options(context, "scene")
         arrange(path, capture, (scene,) if scene else SCENES, hard=KINDS[kind])
     else:
         report = import_dataset(kind, path, capture, scene, every=every, hold_out=hold_out, **options)
         thresholds = LAYOUTS[kind].thresholds
     if not manifest.exists():
         new_manifest(manifest.stem, capture, thresholds=thresholds)
-    print(f"Run it: python -m toolkit run {manifest}", file=sys.stderr)
+    print(f"Run it: {COMMAND} run {manifest}", file=sys.stderr)
     return report
+
+
+def _refuse_options(context: typer.Context, *known: str) -> None:
+    """Refuse given options of the running command, except the known ones: they would have no effect."""
+    for one in context.command.params:
+        source = context.get_parameter_source(one.name or "")
+        if one.param_type_name == "option" and one.name not in known and source and source.name == "COMMANDLINE":
+            raise ManifestError.at(one.opts[0], "an option without effect on this data set", do="Leave it out.")
 
 
 def _manifest_of(capture: Path) -> Path:
