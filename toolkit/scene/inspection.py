@@ -173,6 +173,16 @@ class WorstQueries:
         self._queries = [queries[k] for k in order]
         self.names = [f"{pair.label}: {shown_name(pair.names[number])}" for pair, number in self._queries]
 
+    def table(self, most: int = 12) -> pd.DataFrame:
+        """Return the worst: devices, status, inliers, errors (NaN without a pose or a true one), names of images."""
+        errors = ["rotation_error_deg", "translation_error_m"]
+        columns = ["map_device", "query_device", "status", "num_inliers", *errors, "image"]
+        rows = []
+        for pair, number in self._queries[:most]:
+            devices = dict(zip(columns, pair_devices(pair._h5.stem), strict=False))
+            rows.append({**pair.localized.localizations.errors.iloc[number].to_dict(), **devices})
+        return pd.DataFrame(rows).reindex(columns=columns).replace(np.inf, np.nan)
+
     def look(self, rank: int | str = 0) -> Answer:
         """Return a query by its rank, 0 for the worst of all, or by the name of one of its images.
 
