@@ -2,6 +2,7 @@
 
 import copy
 import logging
+import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -549,7 +550,10 @@ class Map:
         if "kinds" in features and "escalation" not in features:
             rest = [name for name in before.features.escalation if name not in features["kinds"]]
             changes |= {"features": {**features, "escalation": rest}}
-        settings = LocalizeSettings.of(before, changes)
+        try:
+            settings = LocalizeSettings.of(before, changes)
+        except ManifestError as error:
+            raise ManifestError(re.sub(r"^\w+:\s+", "localize: ", str(error))) from None
         if fixed := [name for name in FIXED_BY_MAP if getattr(settings, name) != getattr(before, name)]:
             raise ManifestError(
                 f"localize.{fixed[0]}: cannot change for one query, as the whole map depends on it. "
