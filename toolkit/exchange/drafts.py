@@ -361,7 +361,7 @@ class Draft(Options):
                 self.images.append(image)
             else:
                 self.others.setdefault("in the session already", []).append(image.name)
-        if not self.images:
+        if images and not self.images:
             raise CaptureError(f"{self.session}: has all {len(images)} images already, so there is none to add.")
         if not is_linked_here(self.session):  # links of others do not become the user's own
             self.placing = "copy"
