@@ -318,6 +318,8 @@ def test_a_table_on_a_page_has_medians_first_and_says_nothing_twice() -> None:
     assert shown.loc["hl in ios"].tolist() == ["0.10", "20", "50", 3, 2, "c.png", "1"]
     left_out = notebook.readable(pd.DataFrame([row | {"state": "left out: x", "reason": "x"}]))
     assert {"state", "reason"} <= set(left_out.columns)
+    unknown = pd.DataFrame([row | {"threshold": float("nan")}, row | {"threshold": "(1deg,0.1m)"}])
+    assert notebook.readable(unknown)["threshold"].fillna("").tolist() == ["", "1°, 0.1\N{NO-BREAK SPACE}m"], "no truth"
     sessions = pd.DataFrame({"session": ["ios_map"], "images": [3], "path": ["p"]})
     assert notebook.readable(sessions).columns.tolist() == ["session", "images"]
 

@@ -239,7 +239,7 @@ def readable(table: "pd.DataFrame", unit: str = "m") -> "pd.DataFrame":
     for name in {"still", "recording"} & {*shown}:
         shown[name] = [Path(path).name for path in shown[name]]
     if "threshold" in shown:
-        shown["threshold"] = shown["threshold"].map(threshold_text)
+        shown["threshold"] = shown["threshold"].map(threshold_text, na_action="ignore")
     words = ("step", "threshold", "median", "recall@")
     first = [name for word in words for name in shown if name.startswith(word)]
     shown = shown[[*first, *(name for name in shown if name not in first)]]
