@@ -17,7 +17,7 @@ NUMBERS := $(addprefix tests/,alignment embedders features mapping models pose p
 FAULTS := $(addprefix tests/,capture exchange fuzz store $(addsuffix .py,$(addprefix test_,damage empty_sets files kills \
 	lineage manifest pretend_device properties stops)))
 NOTEBOOKS := $(addprefix tests/,figures report results runs viewer $(addsuffix .py,$(addprefix test_,compare_notebook \
-	docs lab notebooks own_images package pipeline rooms visualize)))
+	docs lab notebooks own_images package pages pipeline rooms visualize)))
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -27,10 +27,10 @@ help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1|/' | column -t -s '|'
 
 demo: $(INSTALLED)  ## render a small capture, localize all nine pairs, write a report
-	$(BIN)/python -m toolkit run demo
+	$(BIN)/visloc run demo
 
 run: $(INSTALLED)  ## run RUN_MANIFEST=data_manifests/<yours>.yaml
-	$(BIN)/python -m toolkit run $(RUN_MANIFEST)
+	$(BIN)/visloc run $(RUN_MANIFEST)
 
 test: $(INSTALLED)  ## run the default tests, about 3 minutes on 2 idle cores
 	$(PYTEST)
@@ -92,7 +92,7 @@ docs-view: $(INSTALLED)  ## draw the documentation's picture of the localization
 
 # Your changes to a copy stay: a newer notebook replaces it only if you have not changed it.
 lab: $(INSTALLED)  ## open JupyterLab on your own copies of the notebooks, in lab/; LAB_ARGS="--port 9999" or others
-	$(BIN)/python -m toolkit lab $(LAB_ARGS)
+	$(BIN)/visloc lab $(LAB_ARGS)
 
 lint: $(INSTALLED)  ## run ruff and mypy
 	$(BIN)/python -m ruff check .

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from jupyter_server.services.contents.filemanager import FileContentsManager
+from nbconvert import HTMLExporter
 from traitlets.config import PyFileConfigLoader
 from typer.testing import CliRunner
 
@@ -38,6 +39,8 @@ def test_a_saved_notebook_has_its_results_and_no_widgets(tmp_path: Path) -> None
     assert saved["cells"][0]["outputs"][1]["data"] == picture["data"]
     (kept,) = saved["cells"][1]["outputs"]
     assert kept["data"] == picture["data"], "what a viewer left for a page without a kernel"
+    page, _ = HTMLExporter().from_filename(str(tmp_path / "mine.ipynb"))
+    assert page.count("data:image/jpeg;base64,aGk=") == 2, "in HTML; nbconvert prefers widgets"
     assert saved["cells"][2]["source"] == "# mine"
     assert "widgets" not in saved["metadata"]
     manager.save({"type": "file", "format": "text", "content": "a file"}, "file.txt")

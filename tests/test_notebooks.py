@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import nbformat
 import pandas as pd
@@ -132,15 +133,30 @@ def test_every_parameter_has_an_effect(stage: str) -> None:
     assert notebook_parameters(notebook_path(stage)).keys() <= used | of_stage
 
 
-def test_tables_link_to_their_images(small_capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(small_capture.parent)
-    names = "ios_query/raw_data/a b.jpg;ios_query/raw_data/<c>.jpg"
-    table = pd.DataFrame({"status": ["failed: <none>"], "image": [names]}, ["hl in ios"])
-    html = notebook.linked(table, small_capture / "sessions").to_html()
-    folder = f"{small_capture.name}/sessions/ios_query/raw_data"
-    assert f"href='{folder}/a%20b.jpg'" in html
-    assert f"href='{folder}/%3Cc%3E.jpg'" in html
-    assert all(text in html for text in ("hl in ios", "failed: &lt;none&gt;", "&lt;c&gt;.jpg</a>"))
+def test_tables_link_to_their_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the names that the tables of a run have. The session was missing from the links, which led nowhere."""
+    monkeypatch.chdir(tmp_path)
+    for path in ("hl_query/raw_data/a b.jpg", "hl_query/raw_data/import/images/<c>.jpg"):
+        (tmp_path / "P/sessions" / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "P/sessions" / path).touch()
+    table = pd.DataFrame({"status": ["failed: <none>"], "image": ["a b.jpg;<c>.jpg;gone.jpg"]}, ["hl in ios"])
+    html = notebook.linked(table, tmp_path / "P/sessions").to_html()
+    assert "href='P/sessions/hl_query/raw_data/a%20b.jpg'" in html
+    assert "href='P/sessions/hl_query/raw_data/import/images/%3Cc%3E.jpg'" in html
+    assert all(text in html for text in ("hl in ios", "failed: &lt;none&gt;", "&lt;c&gt;.jpg</a> gone.jpg"))
+    roots = [tmp_path / "P/sessions", None]
+    table = pd.DataFrame({"pair": "hl in ios", "image": ["a b.jpg", None], "sessions_root": roots})
+    html = notebook.linked(table).to_html()
+    assert html.count("href='P/sessions/hl_query/raw_data/a%20b.jpg'") == 1
+    assert "sessions_root" not in html
+
+
+@pytest.mark.slow
+def test_tables_of_a_run_link_to_files_that_exist(small_run: Path) -> None:
+    (executed,) = (small_run / "notebooks").glob("*05_evaluate.ipynb")
+    links = re.findall(r"<a href='([^']+)' target", executed.read_text())
+    assert len(links) >= 12
+    assert all((executed.parent / unquote(link)).is_file() for link in links)
 
 
 @pytest.mark.parametrize("stage", STAGES)
@@ -297,11 +313,13 @@ def test_a_table_on_a_page_has_medians_first_and_says_nothing_twice() -> None:
     row = {"map_device": "ios", "query_device": "hl", "state": "evaluated", "queries": 3, "localized": 2, "ok": 2}
     row |= {"recall@(1deg,0.1m)": 0.5, "median_rotation_deg": 0.1, "median_translation_m": 0.2, "path": "/a/b"}
     shown = notebook.readable(pd.DataFrame([row | {"reason": "", "still": "/a/b/c.png", "error_rotation_deg": 1.0}]))
-    names = ["median_deg", "median_m", "recall@1°,0.1m", "queries", "ok", "still", "error_deg"]
+    names = ["median_deg", "median_cm", "recall@1°,0.1m [%]", "queries", "ok", "still", "error_deg"]
     assert shown.columns.tolist() == names
-    assert shown.loc["hl in ios"].tolist() == [0.1, 0.2, 0.5, 3, 2, "c.png", 1.0]
+    assert shown.loc["hl in ios"].tolist() == ["0.10", "20", "50", 3, 2, "c.png", "1"]
     left_out = notebook.readable(pd.DataFrame([row | {"state": "left out: x", "reason": "x"}]))
     assert {"state", "reason"} <= set(left_out.columns)
+    unknown = pd.DataFrame([row | {"threshold": float("nan")}, row | {"threshold": "(1deg,0.1m)"}])
+    assert notebook.readable(unknown)["threshold"].fillna("").tolist() == ["", "1°, 0.1\N{NO-BREAK SPACE}m"], "no truth"
     sessions = pd.DataFrame({"session": ["ios_map"], "images": [3], "path": ["p"]})
     assert notebook.readable(sessions).columns.tolist() == ["session", "images"]
 

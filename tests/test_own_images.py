@@ -110,7 +110,7 @@ def test_a_transforms_json_is_taken_as_a_table(tmp_path: Path) -> None:
         import_once(tmp_path, place, "ios", "query", table=file)
     with pytest.raises(ManifestError, match="poses_are: found 'cam_from_world', expected world_from_cam"):
         import_once(images, place, "ios", "query", table=file, poses_are="cam_from_world")
-    with pytest.raises(CaptureError, match=r"not a CSV table. .* python -m toolkit import transforms"):
+    with pytest.raises(CaptureError, match=r"not a CSV table. .* visloc import transforms"):
         import_images(images, place, "ios", "query", table=file)
     with pytest.raises(CaptureError, match=r"A map needs poses: .*, or import a transforms.json or a COLMAP model"):
         import_images(images, place, "hl", "map")
@@ -139,6 +139,8 @@ def test_poses_are_listed_with_the_names_of_images(tmp_path: Path) -> None:
         ({"hold_out": 1, "photographs": "HERE"}, "hold_out: found 1, expected 2"),
         ({"photographs": "HERE", "map_images": "HERE"}, "photographs: .* no effect with map_images"),
         ({"sessions_root": "HERE", "photographs": "HERE"}, "sessions_root: .* no effect with photographs"),
+        ({"run": "runs/fox", "photographs": "HERE"}, "run: found 'runs/fox', which has no effect with photographs"),
+        ({"run": "runs/fox", "sessions_root": "HERE"}, "run: .* no effect with sessions_root"),
         ({"map_images": "HERE/none", "map_table": "HERE"}, "map_images: found '.*/none', which does not exist"),
         ({"map_images": "HERE", "query_images": "HERE"}, "map_table: found None, but a map needs poses"),
         ({"map_images": "HERE", "map_table": "HERE"}, "query_images: found None"),
@@ -169,8 +171,10 @@ def test_photographs_without_poses_become_map_and_queries(small_capture: Path, t
 
 
 @pytest.mark.slow
-def test_it_runs_again_and_stops_where_the_input_is_another(small_capture: Path, tmp_path: Path) -> None:
-    folders = {"sessions_root": str(small_capture / "sessions"), "out_dir": str(tmp_path / "OWN")}
+def test_it_runs_again_and_stops_where_the_input_is_another(
+    small_run: Path, small_capture: Path, tmp_path: Path
+) -> None:
+    folders = {"run": str(small_run), "out_dir": str(tmp_path / "OWN")}
     for _ in range(2):
         execute(PATH, tmp_path / "out.ipynb", folders)
         page = (tmp_path / "out.ipynb").read_text()

@@ -20,7 +20,7 @@ from nbformat.v4 import new_code_cell, new_notebook, new_output
 from safetensors.torch import save_file
 
 from toolkit import notebook, pipeline
-from toolkit.errors import ManifestError, ToolkitError, WeightsError
+from toolkit.errors import COMMAND_VARIABLE, ManifestError, ToolkitError, WeightsError
 from toolkit.files import SceneFiles, write_sidecar, write_text
 from toolkit.manifest import (
     STAGES,
@@ -389,6 +389,27 @@ def test_another_python_is_told_which_to_take() -> None:
     done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
     assert done.returncode == 1
     assert re.fullmatch(r"Error: .* has no package typer\. .*: \.venv/bin/python -m toolkit, .*\n", done.stderr)
+
+
+@pytest.mark.parametrize(
+    ("start", "called"),
+    [
+        (["-m", "toolkit"], "python -m toolkit"),
+        (["-c", "import sys; sys.argv[0] = 'bin/visloc'; from toolkit.__main__ import main; main()"], "visloc"),
+    ],
+)
+def test_commands_are_printed_as_they_are_called(start: list[str], called: str, tmp_path: Path) -> None:
+    command = [sys.executable, *start, "new", "p", "--out", str(tmp_path)]
+    done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True, check=True)
+    assert done.stdout.endswith(f"Run it: {called} run {tmp_path}/p.yaml\n")
+    assert f"then: {called} run" in (tmp_path / "p.yaml").read_text()
+
+
+def test_a_kernel_prints_commands_as_its_run_is_called() -> None:
+    environment = {**os.environ, COMMAND_VARIABLE: "python -m toolkit"}
+    ask = [sys.executable, "-c", "from toolkit.errors import COMMAND; print(COMMAND)"]
+    done = subprocess.run(ask, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == "python -m toolkit\n"
 
 
 def test_the_command_line_prints_errors_without_traceback(tmp_path: Path) -> None:

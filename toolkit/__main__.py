@@ -21,6 +21,8 @@ try:
 
     from toolkit import __version__
     from toolkit.errors import (
+        COMMAND,
+        COMMAND_VARIABLE,
         ArtifactError,
         IncompleteError,
         ManifestError,
@@ -158,7 +160,7 @@ def run(
         raise
     tell(f"Report: {run_dir / 'report.html'}")
     if only == pipeline.MAP:
-        tell(f"Localize a photograph: python -m toolkit localize {run_dir} PHOTOGRAPH")
+        tell(f"Localize a photograph: {COMMAND} localize {run_dir} PHOTOGRAPH")
     result = summary(run_dir)
     if as_json:
         _print_json(result)
@@ -311,7 +313,7 @@ def new(
     from toolkit.exchange.new_manifest import new_manifest
 
     path = new_manifest(name, capture, out)
-    print(f"Manifest: {path}\nRun it: python -m toolkit run {path}")
+    print(f"Manifest: {path}\nRun it: {COMMAND} run {path}")
 
 
 @app.command()
@@ -505,6 +507,7 @@ def import_transforms(
 
 @importer("dataset")
 def import_dataset(
+    context: typer.Context,
     kind: Annotated[str, Argument(metavar="KIND", help=_KINDS)],
     path: Annotated[Path, Argument(help="Folder of the data set as published, or of one of its scenes.")],
     capture: Annotated[Path, Argument(help="New capture folder, with a map and a query session.")],
@@ -516,18 +519,30 @@ def import_dataset(
     """Make a map and queries from a data set of the field, and a manifest with its thresholds."""
     from toolkit.exchange.datasets import LAYOUTS, import_dataset
     from toolkit.exchange.new_manifest import new_manifest
+    from toolkit.manifest import nearest
     from toolkit.synthetic.photographs import KINDS, SCENES, THRESHOLDS, arrange
 
+    if kind not in {*LAYOUTS, *KINDS}:
+        raise ManifestError.at("KIND", repr(kind), do=nearest(kind, [*LAYOUTS, *KINDS]))
     manifest, report, thresholds = _manifest_of(capture), None, THRESHOLDS
     if kind in KINDS:
+        _refuse_options(context, "scene")
         arrange(path, capture, (scene,) if scene else SCENES, hard=KINDS[kind])
     else:
         report = import_dataset(kind, path, capture, scene, every=every, hold_out=hold_out, **options)
         thresholds = LAYOUTS[kind].thresholds
     if not manifest.exists():
         new_manifest(manifest.stem, capture, thresholds=thresholds)
-    print(f"Run it: python -m toolkit run {manifest}", file=sys.stderr)
+    print(f"Run it: {COMMAND} run {manifest}", file=sys.stderr)
     return report
+
+
+def _refuse_options(context: typer.Context, *known: str) -> None:
+    """Refuse given options of the running command, except the known ones: they would have no effect."""
+    for one in context.command.params:
+        source = context.get_parameter_source(one.name or "")
+        if one.param_type_name == "option" and one.name not in known and source and source.name == "COMMANDLINE":
+            raise ManifestError.at(one.opts[0], "an option without effect on this data set", do="Leave it out.")
 
 
 def _manifest_of(capture: Path) -> Path:
@@ -601,10 +616,10 @@ def reconstruct(
     run_dir = pipeline.run(manifest, None if hold_out else pipeline.MAP, say=tell)
     if hold_out:
         tell(f"Report: {run_dir / 'report.html'}")
-    tell(f"Localize a photograph: python -m toolkit localize {run_dir} PHOTOGRAPH --picture above.png")
+    tell(f"Localize a photograph: {COMMAND} localize {run_dir} PHOTOGRAPH --picture above.png")
     if not hold_out:
-        tell(f"Or many: python -m toolkit import images QUERIES {capture} --device {device}{option}, and then")
-        tell(f"python -m toolkit run {manifest}")
+        tell(f"Or many: {COMMAND} import images QUERIES {capture} --device {device}{option}, and then")
+        tell(f"{COMMAND} run {manifest}")
 
 
 @export_app.command("colmap")
@@ -817,6 +832,7 @@ def main() -> None:
     if not sys.stderr.isatty():
         os.environ.setdefault("TQDM_MININTERVAL", "30")  # seconds between lines about progress in a log
 
+    os.environ[COMMAND_VARIABLE] = COMMAND
     received: list[int] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -827,7 +843,7 @@ def main() -> None:
         if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) == signal.SIG_DFL:
             signal.signal(getattr(signal, name), stop)
     try:
-        app(prog_name="visloc" if Path(sys.argv[0]).stem == "visloc" else "python -m toolkit")
+        app(prog_name=COMMAND)
     except SystemExit as end:  # typer has printed the message
         if end.code != INTERRUPTED:
             raise SystemExit(1 if end.code == USAGE else end.code) from None

@@ -5,6 +5,7 @@ import logging
 import os
 import re
 import signal
+import sys
 import traceback
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, requires
@@ -17,6 +18,11 @@ import numpy as np
 
 log = logging.getLogger(__name__)
 
+COMMAND_VARIABLE = "TOOLKIT_COMMAND"
+"""Environment variable that tells kernels and workers how the command line was called."""
+_BY_MODULE = Path(sys.argv[0]).parts[-2:] == (Path(__file__).parent.name, "__main__.py")
+COMMAND = "python -m toolkit" if _BY_MODULE else os.environ.get(COMMAND_VARIABLE, "visloc")
+"""The command line in messages, by the name it was called by."""
 INTERNAL = "internal: "
 """Prefix of the reason in a row that failed because of a bug of the toolkit; the next run tries the row again."""
 _OF_THE_MACHINE = ("out of memory", "allocate memory", "insufficient memory", "not enough memory", "bad_alloc",

@@ -26,7 +26,7 @@ from urllib.parse import quote
 import xxhash
 
 from toolkit import __version__
-from toolkit.errors import ArtifactError, ToolkitError
+from toolkit.errors import COMMAND, ArtifactError, ToolkitError
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -614,7 +614,7 @@ def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:
                 if line.strip():
                     rows.append(_checked(json.loads(line), {"timestamp", "sensor_id", "topk", *needed}))
     except FileNotFoundError:
-        do = "Run the retrieve stage first (python -m toolkit run MANIFEST --only retrieve)."
+        do = f"Run the retrieve stage first ({COMMAND} run MANIFEST --only retrieve)."
         raise ArtifactError.at(path, "no such file of references", do=do) from None
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise ArtifactError(f"{path}, line {number}: not a retrieval row ({error}). Retrieve again.") from None

@@ -27,6 +27,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, NonNegativeInt, Validat
 from toolkit import errors
 from toolkit.errors import CaptureError, ManifestError, StageError, shortage
 from toolkit.files import (
+    IMPORTED,
     SceneFiles,
     link_folder,
     older_files,
@@ -145,21 +146,10 @@ def start(
         logging.captureWarnings(True)
         log_to(Path(run_log))
     check_given(stage)
-    taken_from = find_run(run) if run is not None and sessions_root is None else None
-    by_hand: Path | None = None
-    stages = read_json(taken_from / RECORD).get("stages") if taken_from is not None else None
-    if taken_from is not None and stages:
-        sessions_root = stages[0]["parameters"].get("sessions_root")
-        by_hand = taken_from.with_name(f"{taken_from.name}-by-hand")
-    elif taken_from is not None and not is_demo(taken_from):
-        from toolkit.results.opening import no_such_run  # takes half a second, for an error alone
-
-        raise no_such_run(taken_from)
-    else:
-        taken_from = None
-    sessions = sessions_or_demo(sessions_root)
+    sessions, taken_from = sessions_of(run, sessions_root)
     _check_devices_and_queries(stage, sessions)
     scene = sessions.parent.name
+    by_hand = taken_from.with_name(f"{taken_from.name}-by-hand") if taken_from else None
     files = SceneFiles(by_hand or project_root() / "runs" / f"{scene}-by-hand", scene)
     source = taken_from or _finished_run(files.run.parent, scene)
     if None in folders.values():
@@ -195,13 +185,30 @@ def _require_outside_of_runs(name: str, folder: Path) -> None:
         raise ManifestError.at(name, found, do="Leave it out, or give another folder.")
 
 
-def sessions_or_demo(sessions_root: str | None) -> Path:
-    """Return the folder as an absolute path; None: folder `sessions` of the demo capture, rendered if absent."""
+def sessions_of(run: str | None, sessions_root: str | None) -> tuple[Path, Path | None]:
+    """Return the folder `sessions` of a notebook's capture, and the finished run that it is of, if any.
+
+    Args:
+        run: run folder, see `find_run`. If it is absent, and the demo's, the demo capture is rendered.
+        sessions_root: the folder, instead of that of the run.
+
+    Raises:
+        ArtifactError: there is no such run.
+    """
+    if sessions_root is None and run is not None:
+        stages = read_json((found := find_run(run)) / RECORD).get("stages")
+        if stages:
+            return Path(stages[0]["parameters"]["sessions_root"]).expanduser().resolve(), found
+        if not is_demo(found):
+            from toolkit.results.opening import no_such_run  # takes half a second, for an error alone
+
+            raise no_such_run(found)
     if sessions_root is not None:
-        return Path(sessions_root).expanduser().resolve()
+        return Path(sessions_root).expanduser().resolve(), None
     from toolkit.synthetic import render_capture
 
-    return render_capture(project_root() / "data" / "demo", **DemoData(hard=True).model_dump()) / "sessions"
+    demo = render_capture(project_root() / "data" / "demo", **DemoData(hard=True).model_dump())
+    return demo / "sessions", None
 
 
 def own_folder(folder: str | None, scene: str, images: str | None = None) -> Path:
@@ -222,11 +229,14 @@ def own_folder(folder: str | None, scene: str, images: str | None = None) -> Pat
 
 
 def readable(table: "pd.DataFrame") -> "pd.DataFrame":
-    """Return a stage's table in a form that fits a page: rows `<query> in <map>`, medians and recall first, no folders.
+    """Return a stage's table as texts that fit a page: rows `<query> in <map>`, medians and recall first, no folders.
 
     Columns without information are dropped: a `reason` that is always empty, a `state` that is always `evaluated`, and
-    `localized`, the sum of `ok` and `low_confidence`. Column names are shortened where the unit implies the quantity.
+    `localized`, the sum of `ok` and `low_confidence`. Errors of positions in meters are shown in cm, recall in %. Names
+    of columns are shortened where the unit implies the quantity.
     """
+    from toolkit.results.metrics import small_unit, threshold_text
+
     trivial = {"state": "evaluated", "reason": ""}
     dropped = [name for name, text in trivial.items() if name in table and (table[name] == text).all()]
     shown = table.drop(columns=["path", "localized", *dropped], errors="ignore")
@@ -234,34 +244,65 @@ def readable(table: "pd.DataFrame") -> "pd.DataFrame":
         shown.index = shown.pop("query_device") + " in " + shown.pop("map_device")
     for name in {"still", "recording"} & {*shown}:
         shown[name] = [Path(path).name for path in shown[name]]
-    first = [name for word in ("median", "recall@") for name in shown if name.startswith(word)]
+    if "threshold" in shown:
+        shown["threshold"] = shown["threshold"].map(threshold_text, na_action="ignore")
+    words = ("step", "threshold", "median", "recall@")
+    first = [name for word in words for name in shown if name.startswith(word)]
     shown = shown[[*first, *(name for name in shown if name not in first)]]
-    return shown.rename(columns=_short_column)
+    small, factor = small_unit("m")
+    for name in [name for name in shown if name.endswith(("translation_m", "translation_error_m"))]:
+        shown[name] *= factor
+        shown = shown.rename(columns={name: f"{name.removesuffix('m')}{small}"})
+    texts = {name: _texts(shown[name]) for name in shown.select_dtypes(float)}
+    return shown.assign(**texts).rename(columns=_short_column)
 
 
-def linked(table: "pd.DataFrame", sessions_root: Path) -> "Styler":
-    """Return a table whose column `image` links to the image files, as a notebook shows it.
+def _texts(column: "pd.Series[float]") -> "pd.Series[str]":
+    """Return numbers with about three significant digits; recall in %."""
+    from toolkit.figures.style import number, percent
+
+    if str(column.name).startswith("recall@"):
+        return column.map(percent)
+    return column.map(lambda value: f"{value:.0f}" if float(value).is_integer() else number(value))
+
+
+def linked(table: "pd.DataFrame", sessions_root: Path | None = None) -> "Styler":
+    """Return a table of queries whose column `image` links to the image files, as a notebook shows it.
 
     Args:
-        table: image names, `<session>/raw_data/<path>`; those of a rig are joined by `;`.
-        sessions_root: `<capture>/sessions`.
+        table: queries by index or column `pair`, `<query device> in <map device>`; `image`, the user's names of its
+            images (`files.own_name`), joined by `;`.
+        sessions_root: `<capture>/sessions`; None: the column `sessions_root`, a folder or None for each query.
     """
+    from toolkit.figures.query_images import MAX_LETTERS, shown_name
 
-    def link(names: str) -> str:
-        links = {name: relative_url(sessions_root.resolve() / name) for name in names.split(";")}
-        return " ".join(f"<a href='{link}' target='_blank'>{escape(name)}</a>" for name, link in links.items())
+    def links(pair: str, names: str, root: Path | None) -> str:
+        raw_data = (root or Path()).resolve() / f"{pair.partition(' in ')[0]}_query" / "raw_data"
+        shown = []
+        for name in filter(None, names.split(";")):
+            path = next((path for path in (raw_data / name, raw_data / IMPORTED / name) if path.is_file()), None)
+            text = escape(shown_name(name, MAX_LETTERS))
+            shown.append(f"<a href='{relative_url(path)}' target='_blank'>{text}</a>" if root and path else text)
+        return " ".join(shown)
 
     table = table.drop(columns=["timestamp", "device_id"], errors="ignore")  # as the image's name tells
     # A Styler needs unique names of rows.
     table = table.reset_index(names="pair", drop=table.index.inferred_type != "string")
-    shown = table.style.format({"image": link}).set_properties(**{"text-align": "left"}).hide(axis="index")
-    return shown.format(escape="html", precision=3, subset=[name for name in table.columns if name != "image"])
+    roots = table.pop("sessions_root") if "sessions_root" in table else [sessions_root] * len(table)
+    rows = zip(table["pair"], table["image"].fillna(""), roots, strict=True)
+    table["image"] = [links(*row) for row in rows]
+    texts = {name: _texts(table[name]) for name in table.select_dtypes(float)}
+    shown = table.assign(**texts).style.set_properties(**{"text-align": "left"}).hide(axis="index")
+    shown = shown.set_properties(subset=["pair"], **{"white-space": "nowrap"})
+    shown = shown.set_properties(subset=["image"], **{"overflow-wrap": "anywhere", "min-width": "20em"})
+    shown = shown.set_table_styles([{"selector": "th", "props": "text-align: left"}])
+    return shown.format(escape="html", subset=[name for name in table.columns if name != "image"])
 
 
 def _short_column(name: str) -> str:
-    """Return `median_deg` for `median_rotation_deg`, and `recall@1°,0.1m` for `recall@(1deg,0.1m)`."""
-    if name.startswith("recall@("):
-        return name.replace("deg", "°").replace("(", "").replace(")", "")
+    """Return `median_deg` for `median_rotation_deg`, and `recall@1°,0.1m [%]` for `recall@(1deg,0.1m)`."""
+    if name.startswith("recall@"):
+        return f"{name.replace('deg', '°').replace('(', '').replace(')', '')} [%]"
     return re.sub(r"(rotation|translation)_(?=\w*(deg|m|L)$)", "", name)
 
 
@@ -484,7 +525,8 @@ _OWN = ("photographs", "map_images", "query_images")
 _NEEDS = {"map_table": ("map_images",), "query_table": ("query_images",), "camera": _OWN, "hold_out": ("photographs",),
           "poses_are": _OWN[1:], "unit_m": _OWN[1:]}  # fmt: skip
 """Of notebook 00: parameters that have an effect only if one of these is given, too."""
-_EXCLUDES = {"photographs": ("map_images",), "sessions_root": _OWN, "hold_out": ("query_images",)}
+_EXCLUDES = {"photographs": ("map_images",), "run": (*_OWN, "sessions_root"), "sessions_root": _OWN,
+             "hold_out": ("query_images",)}  # fmt: skip
 """Of notebook 00: parameters that have no effect if one of these is given."""
 
 

@@ -23,7 +23,16 @@ from toolkit.capture.devices import extra_devices, table_record
 from toolkit.capture.names import allow_outside
 from toolkit.embedders import WEIGHTS as EMBEDDER_WEIGHTS
 from toolkit.embedders import resolve_model
-from toolkit.errors import ArtifactError, ManifestError, StageError, ToolkitError, exit_code, require_packages, sentence
+from toolkit.errors import (
+    COMMAND,
+    ArtifactError,
+    ManifestError,
+    StageError,
+    ToolkitError,
+    exit_code,
+    require_packages,
+    sentence,
+)
 from toolkit.exchange.download import is_unfinished
 from toolkit.features.matching import local_weights, resolve_auto
 from toolkit.files import (
@@ -168,7 +177,7 @@ def runs_to_compare(folder: str | Path, others: Sequence[str | Path] | None = No
         for error in failed:
             raise error
     if not beside():
-        do = f"Name runs, or make one: python -m toolkit run MANIFEST --sweep key=a,b makes {first.name}-key-a."
+        do = f"Name runs, or make one: {COMMAND} run MANIFEST --sweep key=a,b makes {first.name}-key-a."
         raise ArtifactError.at("others", f"no run beside {first}", "runs to compare with it", do)
     return [first, *beside()]
 
@@ -250,7 +259,7 @@ def _check(manifest: Manifest, manifest_path: str | Path, only: str | None) -> N
             raise ManifestError(f"--only {only}: no such stage. {nearest(stage, (*STAGES, MAP))}")
         if stage not in manifest.stages and only != MAP:
             raise ManifestError(f"--only {only}: {manifest_path} has no section `{stage}`, so the stage is off.")
-    fetch = f"python -m toolkit download {manifest_path}"
+    fetch = f"{COMMAND} download {manifest_path}"
     for capture in map(Path, manifest.captures):
         if is_unfinished(capture):
             raise ManifestError(f"{capture}: its download is not complete. Continue it first: {fetch}")

@@ -239,7 +239,7 @@ def test_a_malformed_line_is_named(tmp_path: Path, file: str, line: str | bytes,
         Session.open(path)
     text = str(caught.value)
     assert f"{path / file}, line 4: {message}" in text
-    assert "python -m toolkit check" in text or " again, " in text
+    assert "visloc check" in text or " again, " in text
 
 
 def test_scans_and_fixes_are_tables(tmp_path: Path) -> None:

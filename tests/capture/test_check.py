@@ -220,7 +220,7 @@ def test_a_long_list_of_problems_can_be_cut(capture: Path) -> None:
     lines = report.text(most=2).splitlines()
     assert str(report.problems[1]) in lines
     assert str(report.problems[2]) not in lines
-    assert f"... and {count - 2} more: python -m toolkit check {capture}" in lines
+    assert f"... and {count - 2} more: visloc check {capture}" in lines
     assert "more:" not in report.text()
     assert "more:" not in report.text(most=count)
 

@@ -1,5 +1,6 @@
 """Data sets of the field, in small copies of the layouts in which they are published."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -254,6 +255,20 @@ def test_only_every_such_image_is_taken(tmp_path: Path) -> None:
         ["seq-01/frame-000000.color.png"], ["seq-03/frame-000000.color.png"],
     ]  # fmt: skip
     assert [(one["count"], one["reason"]) for one in report.record["left out"]] == [(2, "not taken by --every")]
+
+
+def test_what_has_no_effect_on_a_data_set_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`--device`, `--every`, `--masks` and `--json` of strecha were ignored without a word."""
+    monkeypatch.chdir(tmp_path)
+    for option in (["--device", "hl"], ["--every", "2"], ["--masks", "m"], ["--hold-out", "4"], ["--json"]):
+        done = CliRunner().invoke(app, ["import", "dataset", "strecha-hard", ".", "PLACE", *option])
+        assert isinstance(done.exception, ManifestError)
+        assert str(done.exception) == f"{option[0]}: found an option without effect on this data set. Leave it out."
+    done = CliRunner().invoke(app, ["import", "dataset", "strecha", ".", "PLACE", "--scene", "entry"])
+    assert "gt_dense_cameras" in str(done.exception), "--scene has one"
+    done = CliRunner().invoke(app, ["import", "dataset", "strech", ".", "PLACE"])
+    assert re.match(r"KIND: found 'strech'. Did you mean 'strecha'\?.*7scenes.*strecha-hard", str(done.exception))
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:

@@ -733,7 +733,7 @@ def test_sessions_and_captures_have_to_be_known(manifest: Path) -> None:
 
 
 def test_a_run_says_what_to_download(manifest: Path) -> None:
-    with pytest.raises(ManifestError, match=r"python -m toolkit download .*place"):
+    with pytest.raises(ManifestError, match=r"visloc download .*place"):
         pipeline.run(manifest)
 
 

@@ -128,6 +128,10 @@ def test_queries_are_added_to_a_session_that_is_missing_or_has_times(tmp_path: P
     session = Capture.open(tmp_path / "PLACE")["ios_query"]
     assert np.diff(session.images["timestamp"]).tolist() == [24 * 3600 * 10**6]
     assert len(session.keyframes()) == 2
+    (tmp_path / "3").mkdir()
+    PIL.Image.new("RGB", (64, 48)).save(tmp_path / "3" / "3.jpg")
+    with pytest.raises(CaptureError, match=r"none of 1 images can be imported.*no focal length"):  # not "has all 0"
+        import_images(tmp_path / "3", tmp_path / "PLACE", add=True)
     PIL.Image.new("RGB", (64, 48)).save(tmp_path / "1" / "same.jpg", exif=exif)
     import_images(tmp_path / "1", tmp_path / "PLACE", camera=CAMERA, add=True)  # at a time that is taken
     assert Capture.open(tmp_path / "PLACE")["ios_query"].images["timestamp"].is_unique

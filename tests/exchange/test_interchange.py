@@ -417,7 +417,7 @@ def test_files_that_are_not_photographs_are_said(
     assert sorted(report.images["image"]) == ["a/10.png", "a/2.jpg", "b/1.jpg", "t.tiff"]
     assert (report.images["status"] == "imported").all()
     text = report.text()
-    assert "2  .heic is not read: pip install" in text
+    assert "2  .heic is not read: pip install pillow-heif, or convert" in text, "a package that a registry has"
     assert "1  .gif is not read" in text
     assert "1  its name is not UTF-8" in text
     assert check_capture(tmp_path / "PLACE", deep=True).problems == []

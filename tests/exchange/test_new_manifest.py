@@ -23,7 +23,7 @@ def test_the_manifest_is_the_template_with_the_capture_in_it(
     done = CliRunner().invoke(app, ["new", "my-place", str(place)])
     assert done.exit_code == 0, done.output
     path = Path("data_manifests/my-place.yaml")
-    assert done.output.endswith(f"Run it: python -m toolkit run {path}\n")
+    assert done.output.endswith(f"Run it: visloc run {path}\n")
     manifest, template = load_manifest(path), yaml.safe_load(TEMPLATE.read_text())
     assert manifest.name == "my-place"
     assert [Path(one).resolve() for one in manifest.captures] == [small_capture.resolve()]

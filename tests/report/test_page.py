@@ -307,7 +307,7 @@ def test_what_is_known_of_a_map_is_said_and_lengths_without_a_unit_are_no_meters
     (scene / "poses" / f"{scene.name}_map_ios.json").write_text(json.dumps({"unit": None, "depth": 30.0, "text": said}))
     text = text_of(write_report(full).read_text())
     assert text.index("Before you read the numbers.") < text.index(f"_map_ios: {said}") < text.index("mean recall at")
-    assert said not in text[text.index("Not everything could be evaluated.") :]
+    assert said not in text[text.index("Before you trust these numbers:") :]
     assert "45 % mean recall at 1°, 0.1 L" in text
     assert f"L is a tenth of the median scene depth of a map: 3 in {scene.name}_map_ios" in unescape(text)
     assert not re.search(r"\d\s*(cm|m)\b|\[c?m\]", text)

@@ -1,4 +1,7 @@
 import csv
+import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import h5py
@@ -40,19 +43,42 @@ def test_without_an_evaluation_the_main_table_counts() -> None:
 
 def test_tables_are_written_as_csv_and_latex_and_removed_with_their_rows(tmp_path: Path) -> None:
     table = review.main_table(RECALL, QUERIES, [LIMIT])
-    shown = pd.DataFrame({"map_1": ["a & b", "50 %"], "query": ["1°", "–"], "recall [%]": ["80 [38, 96]", "{x}"]})
-    paths = review.write_tables(tmp_path / "report-S", table, shown, "100 % of S")
+    names = ["map_1", "query", "recall 1°, 0.1\N{NO-BREAK SPACE}m [%]", "95 % #"]
+    shown = pd.DataFrame([["a & b", "1°", "80 [38, 96]", "a_b"], ["50 %", "–", "{x}", "#1"]], columns=names)
+    paths = review.write_tables(tmp_path / "report-S", table, shown, "100 % of S_1 & #2")
     assert [path.name for path in paths] == ["report-S.csv", "report-S.tex"]
     with paths[0].open() as stream:
         rows = list(csv.DictReader(stream))
     assert (rows[0][LIMIT], rows[0]["seconds_95"], rows[1][f"{LIMIT}_low"]) == ("0.8", "4.08", "")
     lines = paths[1].read_text().splitlines()
-    assert r"map\_1 & query & recall [\%] \\" in lines
-    assert r"a \& b & 1\textdegree{} & 80 [38, 96] \\" in lines
-    assert r"50 \% & -- & \{x\} \\" in lines
-    assert r"\caption{100 \% of S}" in lines
+    recall = r"\shortstack[r]{{recall}\\{1\textdegree{}, 0.1~m}\\{[\%]}}"
+    assert rf"map\_1 & query & {recall} & \shortstack[r]{{{{95 \%}}\\{{\#}}}} \\" in lines
+    assert r"a \& b & 1\textdegree{} & 80 [38, 96] & a\_b \\" in lines
+    assert r"50 \% & -- & \{x\} & \#1 \\" in lines
+    assert r"\caption{100 \% of S\_1 \& \#2}" in lines
+    text = paths[1].read_text()
+    assert text.count("{") == text.count("}"), "LaTeX does not end otherwise"
+    rows = [line for line in lines if line.endswith(r"\\")]
+    assert {re.sub(r"\\.", "", row).count("&") for row in rows} == {3}, "columns of llrr"
+    assert not re.search(r"(?<!\\)[%#_$]", "".join(rows))
+    assert r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}" in text, "no wider than the page"
     assert review.write_tables(tmp_path / "report-S", table.iloc[:0], shown, "") == []
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs LaTeX: texlive-latex-recommended")
+def test_the_table_of_latex_is_typeset_and_fits_the_page(tmp_path: Path) -> None:
+    columns = ["map", "query", *(f"recall {k}°, 0.1\N{NO-BREAK SPACE}m [%]" for k in range(8)), "queries"]
+    shown = pd.DataFrame([["my_map", "a & b", *["100 [65, 100]"] * 8, "–"]] * 9, columns=columns)
+    review.write_tables(tmp_path / "report-S_1 %", shown, shown, "95 % of S_1")
+    page = r"\documentclass{article}\usepackage{booktabs,graphicx}\begin{document}\input{table}\end{document}"
+    (tmp_path / "page.tex").write_text(page)
+    (tmp_path / "report-S_1 %.tex").rename(tmp_path / "table.tex")
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+    assert "Overfull" not in done.stdout
 
 
 def test_maps_have_images_points_and_observations(tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ def test_unchanged_settings_give_the_same_pose_and_others_are_shown_beside(pair:
     alone = text_of(nearest.after.figure)
     assert "true position error" in alone
     assert not any(text in alone for text in ("inliers", "descriptor matches", "image covered")), "it has none"
-    with pytest.raises(ManifestError, match=r"min_inliers"):
+    with pytest.raises(ManifestError, match=r"^localize: unknown key 'pnp.min_inlier'. Did you mean 'min_inliers'"):
         one.result.what_if({"localize.pnp.min_inlier": 5})
     with pytest.raises(ManifestError, match=r"--set localize.unit"):
         one.result.what_if({"localize.unit": None})

@@ -168,8 +168,10 @@ def test_the_eye_sees_the_chosen_camera_in_the_middle(scene_map: Map) -> None:
     from toolkit.figures.scene_3d import Eye
 
     poses, up = scene_map.session.world_from_cam(), np.array([0.0, 0.0, 2.0])
-    for chosen in (None, poses[0]):
-        eye = Eye.of(poses, up, chosen)
+    away = poses[0] + 1000 * np.eye(4)[:, [3]] * np.array([0, 0, 0, 1])
+    for others in ([], [poses[0]], [away]):
+        eye = Eye.of(poses, up, others)
+        assert np.linalg.norm(eye.target - poses[:, :3, 3].mean(0)) < 500, "not where a query of elsewhere was taken"
         (seen,) = transform(eye.eye_from_world, eye.target)
         np.testing.assert_allclose(seen[:2], 0.0, atol=1e-9)
         assert seen[2] > 1.0

@@ -19,7 +19,7 @@ from toolkit.capture.session import RAW_DATA, SUBSESSIONS, Session
 from toolkit.capture.tables import ALIGNED, COLUMNS, POSE_NAMES, SIGNALS, KeyIndex, key_of, read_table, times_of
 from toolkit.capture.world_up import estimate_world_up, posed_photographs
 from toolkit.capture.writing import read_depth
-from toolkit.errors import CaptureError, ImageError
+from toolkit.errors import COMMAND, CaptureError, ImageError
 from toolkit.files import read_json
 from toolkit.geometry import unit
 
@@ -78,7 +78,7 @@ class CheckReport:
         if self.problems:
             lines = [str(problem) for problem in self.problems[:most]]
             if len(self.problems) > len(lines):
-                lines.append(f"... and {len(self.problems) - len(lines)} more: python -m toolkit check {self.path}")
+                lines.append(f"... and {len(self.problems) - len(lines)} more: {COMMAND} check {self.path}")
             parts.append("\n".join(lines))
         warnings = len(self.problems) - len(self.errors)
         parts.append(f"{_count(len(self.errors), 'error')}, {_count(warnings, 'warning')}.")

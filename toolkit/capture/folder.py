@@ -9,7 +9,7 @@ from pathlib import Path
 from toolkit.capture.devices import SPLITS, in_order, session_id, session_of
 from toolkit.capture.names import require_name
 from toolkit.capture.session import Session
-from toolkit.errors import CaptureError
+from toolkit.errors import COMMAND, CaptureError
 from toolkit.files import read_json
 
 log = logging.getLogger(__name__)
@@ -105,7 +105,7 @@ class Capture:
         if device in ("all", "auto") and present:
             return present
         if not present:
-            expected = f"sessions/<device>_{split}, as made by `python -m toolkit import ... --split {split}`"
+            expected = f"sessions/<device>_{split}, as made by `{COMMAND} import ... --split {split}`"
             alone = " Without queries, build the map: run MANIFEST --only map." if split == "query" else ""
             raise CaptureError(f"{self.path}: no {split} session. Expected {expected}.{alone}")
         if device not in present:

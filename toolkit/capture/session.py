@@ -135,7 +135,7 @@ class Session:
         listed = "".join(f"<li>{escape(text)}</li>" for text in dict.fromkeys(cameras[:4]))
         return (
             f"<p><b>{escape(self.id)}</b>: {len(self)} images in {len(self.subsessions)} recordings, "
-            f"{len(pd.unique(self.device_ids))} devices. {escape(repr(self))}</p>"
+            f"{len(pd.unique(self.device_ids))} frames.</p>"
             f"{thumbnails(self.image_path(row) for row in sample.tolist())}<ul>{listed}</ul>"
         )
 

@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from toolkit.capture.names import EXPECTED_NAME, HOW_TO_ALLOW, bad_names, outside_allowed
-from toolkit.errors import ArtifactError, CaptureError
+from toolkit.errors import COMMAND, ArtifactError, CaptureError
 from toolkit.files import write_atomic
 from toolkit.geometry import Floats, Ints
 
@@ -147,7 +147,7 @@ def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = 
     if not line:
         raise CaptureError(f"{path}: {fault}. Is the session complete?")
     more = f" ({len(table.problems) - 1} more such lines.)" if len(table.problems) > 1 else ""
-    advice = f"Correct or remove the line; `python -m toolkit check CAPTURE` lists all problems.{more}"
+    advice = f"Correct or remove the line; `{COMMAND} check CAPTURE` lists all problems.{more}"
     raise CaptureError(f"{path}, line {line}: {fault}. {advice}")
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolkit.capture.images import default_workers, prefetch
-from toolkit.errors import ArtifactError, ToolkitError
+from toolkit.errors import COMMAND, ArtifactError, ToolkitError
 from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures
 from toolkit.features.matching import unit_descriptors
 from toolkit.files import file_fingerprint, require_whole, write_atomic
@@ -133,7 +133,7 @@ class Vlad:
         sample = np.concatenate(parts) if parts else np.zeros((0, 1), np.float32)
         if len(sample) < 2:
             fault = f"{count} map images gave {len(sample)} local features"
-            advice = "Check that they can be read and are not blank (`python -m toolkit check CAPTURE`)"
+            advice = f"Check that they can be read and are not blank (`{COMMAND} check CAPTURE`)"
             raise ToolkitError(f"A VLAD vocabulary cannot be learned: {fault}. {advice}.")
         empty = np.zeros((0, 0), np.float32)
         arrays = _whitening(sample, LOCAL_DIM) | {"centroids": empty, "projection": empty}

@@ -80,7 +80,7 @@ PHOTOGRAPHS = (*IMAGE_SUFFIXES, *CONVERTED_SUFFIXES, ".dng", ".cr2", ".nef", ".a
 """Formats of photographs, read or not."""
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 CONVERT = "convert them to JPEG or PNG"
-_HOW = dict.fromkeys(HEIC_SUFFIXES, f"pip install 'visual-localization[heic]', or {CONVERT}")
+HEIC_HOW = f"pip install pillow-heif, or {CONVERT}"
 PLACING = ("link", "copy")
 EXIF = "exif"
 """What is given for a table of GPS fixes if the images have them."""
@@ -367,7 +367,7 @@ class Draft(Options):
                 self.images.append(image)
             else:
                 self.others.setdefault("in the session already", []).append(image.name)
-        if not self.images:
+        if images and not self.images:
             raise CaptureError(f"{self.session}: has all {len(images)} images already, so there is none to add.")
         if not is_linked_here(self.session):  # links of others do not become the user's own
             self.placing = "copy"
@@ -630,7 +630,7 @@ class Draft(Options):
         if is_bad_name(image.name):
             return f"the capture format cannot hold this name, expected {EXPECTED_NAME}"
         if image.name.lower().endswith(HEIC_SUFFIXES) and not heic_is_read():
-            return f"HEIC is not read: {_HOW[HEIC_SUFFIXES[0]]}"
+            return f"HEIC is not read: {HEIC_HOW}"
         try:
             size, exif = read_header(self.source(image.name))
         except ImageError as error:
@@ -763,7 +763,9 @@ def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES, draft:
     others = {"its name is not UTF-8: rename it": broken} if broken else {}
     for name in files:
         if (suffix := name[name.rfind(".") :].lower()) in PHOTOGRAPHS and suffix not in suffixes:
-            others.setdefault(f"{suffix} is not read: {_HOW.get(suffix, CONVERT)}", []).append(name)
+            others.setdefault(f"{suffix} is not read: {HEIC_HOW if suffix in HEIC_SUFFIXES else CONVERT}", []).append(
+                name
+            )
     note = [f"captures in the folder of images are skipped: {', '.join(captures[:3])}"] if captures else []
     if draft is not None:
         draft.others |= others

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from toolkit.capture import Session, Trajectory
 from toolkit.capture.cameras import camera_text
 from toolkit.capture.tables import POSE_NAMES
-from toolkit.errors import ArtifactError, ManifestError
+from toolkit.errors import COMMAND, ArtifactError, ManifestError
 from toolkit.exchange.submission import open_captures
 from toolkit.features.stores import FeatureStore
 from toolkit.files import (
@@ -42,7 +42,7 @@ from toolkit.results.opening import map_inputs
 from toolkit.results.pair import PairResults, names_of_maps
 
 NAMES = ("own", "capture", "file")
-_LOCALIZE = "Run the localize stage first (python -m toolkit run MANIFEST --only localize)."
+_LOCALIZE = f"Run the localize stage first ({COMMAND} run MANIFEST --only localize)."
 Keypoints = Mapping[str, NDArray[np.floating]]
 
 

@@ -22,7 +22,7 @@ from toolkit.capture import parse_camera
 from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.images import decode, exif_camera
 from toolkit.capture.tables import POSE_NAMES
-from toolkit.errors import CaptureError, ImageError, ManifestError
+from toolkit.errors import COMMAND, CaptureError, ImageError, ManifestError
 from toolkit.exchange.colmap_model import (
     NORM_TOLERANCE,
     inverse,
@@ -402,17 +402,17 @@ def _read_table(path: Path) -> pd.DataFrame:
     With poses, column `problem` says why the pose of a row is none.
     """
     if _is_transforms(path):
-        raise CaptureError(f"{path}: not a CSV table. Import it by python -m toolkit import transforms.")
+        raise CaptureError(f"{path}: not a CSV table. Import it by {COMMAND} import transforms.")
     text = read_text(path)
     first = next((line for line in text.splitlines() if line.strip()), "").split()
     of_hloc = len(first) > 4 and first[1] in pycolmap.CameraModelId.__members__
     rows = _read_hloc_list(text) if of_hloc else read_csv(path)
     columns = ("image", *POSE_NAMES, "timestamp", "camera_id", *_CAMERA_COLUMNS)
     if {"heading", "pitch", "roll"} <= set(rows.columns):
-        do = "Export as COLMAP there, and import that by `python -m toolkit import colmap`."
+        do = f"Export as COLMAP there, and import that by `{COMMAND} import colmap`."
         raise CaptureError.at(path, "angles (heading, pitch, roll), as RealityScan writes them", "quaternions", do)
     if path.name == "images.txt" and "image" not in rows:
-        raise CaptureError(f"{path}: not a CSV table. Import its folder by python -m toolkit import colmap.")
+        raise CaptureError(f"{path}: not a CSV table. Import its folder by {COMMAND} import colmap.")
     for name, count in Counter(rows.columns[:-1]).items():
         if name not in columns:
             raise CaptureError(f"{path}: unknown column {name!r}. {nearest(name, columns)}")

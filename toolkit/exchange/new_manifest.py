@@ -9,7 +9,7 @@ from pathlib import Path
 
 from toolkit.capture import Capture
 from toolkit.capture.check import ASKED, check_capture
-from toolkit.errors import ManifestError
+from toolkit.errors import COMMAND, ManifestError
 from toolkit.files import shipped, write_text
 
 TEMPLATE = shipped("data_manifests") / "my-capture.yaml"
@@ -38,14 +38,14 @@ def new_manifest(
         raise ManifestError(f"{path} exists already. Give another name, or remove it first.")
     if not TEMPLATE.is_file():
         raise ManifestError(f"{TEMPLATE}: no such file. Install the toolkit again.")
-    head = [f"# {name}. `python -m toolkit settings` lists all other settings."]
+    head = [f"# {name}. `{COMMAND} settings` lists all other settings."]
     template = TEMPLATE.read_text(encoding="utf-8").splitlines()
     lines = list(dropwhile(lambda line: line.startswith("# "), template))  # its first comment explains how to copy it
     if capture is None:
-        head.append(f"# Name your capture below, then: python -m toolkit run {path}")
+        head.append(f"# Name your capture below, then: {COMMAND} run {path}")
     else:
         report = check_capture(capture).text(MAX_PROBLEMS)
-        head += [f"# Run it: python -m toolkit run {path}", "#", "# Result of `python -m toolkit check`:"]
+        head += [f"# Run it: {COMMAND} run {path}", "#", f"# Result of `{COMMAND} check`:"]
         head += [f"# {line}".rstrip() for line in report.splitlines()]
         changed = _new_lines(Path(capture), path.parent)
         if thresholds:

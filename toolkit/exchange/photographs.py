@@ -21,6 +21,7 @@ from toolkit.capture.images import (
 from toolkit.errors import CaptureError, ImageError
 from toolkit.exchange.drafts import (
     CONVERTED_SUFFIXES,
+    HEIC_HOW,
     HEIC_SUFFIXES,
     IMAGE_SUFFIXES,
     VIDEO_SUFFIXES,
@@ -115,7 +116,7 @@ def _converted(name: str, path: Path, made: Path) -> tuple[str, Path]:
     target = made / f"{name}.png"
     if not target.exists():
         if path.suffix.lower() in HEIC_SUFFIXES and not heic_is_read():
-            raise ImageError("HEIC cannot be read: pip install pillow-heif, or convert it to JPEG")
+            raise ImageError(f"HEIC is not read: {HEIC_HOW}")
         try:
             with write_atomic(target) as temporary:
                 write_png(path, temporary)

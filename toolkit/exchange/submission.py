@@ -89,7 +89,7 @@ def collect(
 ) -> Submission:  # fmt: skip
     """Collect and check the poses of runs for submission; `.write()` then writes the zip file.
 
-    The arguments are those of `python -m toolkit submit`. If the runs contain a scene of the challenge, all its scenes
+    The arguments are those of `visloc submit`. If the runs contain a scene of the challenge, all its scenes
     and pairs are expected, else those of their captures.
 
     Raises:

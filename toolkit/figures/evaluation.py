@@ -198,7 +198,7 @@ def draw_reliability(errors: pd.DataFrame, unit: str = "m") -> "Figure":
         axis.annotate(str(count), (x, 100 * share), textcoords="offset points", fontsize=8, color="0.3", **place)
     axis.set(xlim=(-3, 103), ylim=(-3, 103))
     axis.set(xlabel="stated probability of being right [%]", ylabel="poses that are right [%]")
-    axis.legend(frameon=False, fontsize=8, loc="upper left")
+    figure.legend(loc="outside lower center", frameon=False, fontsize=8)
     axis.grid(alpha=0.25)
     right_is = threshold_text(threshold_name(WRONG, unit))
     figure.suptitle(f"Stated and actual probability of being right (right: {right_is})")
@@ -233,7 +233,7 @@ def draw_deviations(errors: pd.DataFrame, unit: str = "m") -> "Figure":
     plain_log(axis, "xy")
     axis.set(xlabel=f"stated standard deviation of the position [{unit}]", ylabel=f"position error [{unit}]")
     axis.grid(alpha=0.25)
-    axis.legend(frameon=False, fontsize=8, loc="upper left")
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
     figure.suptitle("Stated and actual deviation of the position")
     return figure
 

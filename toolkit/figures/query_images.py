@@ -284,4 +284,4 @@ def draw_worst(queries: Sequence[WorstQuery], title: str = "The worst queries") 
 
 def _off_by(rotation_deg: float, length: float, unit: str) -> str:
     small = f"{100 * length:.2g} cm" if unit == "m" and length < 0.995 else f"{length:.3g} {unit}"
-    return f"off by {rotation_deg:.2g}°, {small}"
+    return f"off by {rotation_deg:.{2 if rotation_deg < 99.5 else 3}g}°, {small}"

@@ -218,10 +218,10 @@ def draw_retrieved(query: RetrievedQuery) -> "Figure":
     _draw_along(along, query, good, retrieved)
     _draw_from_above(above, query, good, retrieved)
     shared_legend(below, (along, above), ncols=4)
-    points = "the map points" if query.points == "map" else "points laid into the views"
+    points = "the map points" if query.points == "map" else "points that the views are assumed to show"
     title = f"query image {query.number}: {shown_name(query.name)}"
     if query.is_known:
-        title += f"\ngreen: overlaps with the query by the true pose and {points} ({MIN_OVERLAP:.0%} of them in view)"
+        title += f"\ngreen: overlaps with the query by its true pose: sees {MIN_OVERLAP:.0%} of {points}"
     figure.suptitle(title, fontsize=10)
     return figure
 

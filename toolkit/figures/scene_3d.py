@@ -29,6 +29,10 @@ def pyramids(poses: Floats, depth: float) -> Floats:
     return np.asarray(np.einsum("nij,kj->nki", poses[:, :3, :3], outline) + poses[:, None, :3, 3])
 
 
+def _extent(poses: Floats) -> float:
+    return max(3.0, float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0))))
+
+
 @dataclass(frozen=True)
 class Eye:
     """Where a scene is looked at from, in world coordinates."""
@@ -41,22 +45,26 @@ class Eye:
     """(3,), of length 1."""
 
     @classmethod
-    def of(cls, poses: Floats, up: Floats, chosen: Floats | None = None) -> "Eye":
-        """Return an eye behind and above the place with the most cameras, or behind and above a chosen camera.
+    def of(cls, poses: Floats, up: Floats, others: Sequence[Floats] = ()) -> "Eye":
+        """Return an eye behind and above the first other camera in the map, or else the place with the most cameras.
+
+        A camera far from the map, such as the true one of a query of elsewhere, would be all that is seen.
 
         Args:
             poses: world_from_cam (N, 4, 4) of the map, at least one.
             up: up direction (3,) of any length.
-            chosen: world_from_cam (4, 4).
+            others: world_from_cam (4, 4).
         """
         up, place = unit(up), places_of(poses[:, :3, 3])
         here = poses[place == np.bincount(place).argmax()]
-        if chosen is not None:
-            nearest = place[np.linalg.norm(poses[:, :3, 3] - chosen[:3, 3], axis=1).argmin()]
-            here = poses[place == nearest]
-        center, view = (here[:, :3, 3].mean(0), here[:, :3, 2].mean(0)) if chosen is None else chosen[:3, [3, 2]].T
+        center, view, reach = here[:, :3, 3].mean(0), here[:, :3, 2].mean(0), _extent(here)
+        for other in others:
+            distances = np.linalg.norm(poses[:, :3, 3] - other[:3, 3], axis=1)
+            around = poses[place == place[distances.argmin()]]
+            if distances.min() < _extent(around):
+                (center, view), reach = other[:3, [3, 2]].T, _extent(around)
+                break
         view = view - up * (view @ up)
-        reach = max(3.0, float(np.linalg.norm(np.ptp(here[:, :3, 3], axis=0))))
         target = center + 0.3 * reach * view
         return cls(target - reach * view + 0.7 * reach * up, target, up)
 

@@ -100,7 +100,7 @@ class Source(Settings):
 
 
 class DatasetSettings(Settings):
-    """Download sources of the captures, for `python -m toolkit download`."""
+    """Download sources of the captures, for `visloc download`."""
 
     page: str
     """Web page of the dataset, with its description, access requests and terms."""

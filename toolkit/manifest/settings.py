@@ -1,6 +1,6 @@
 """The settings of every stage, as one tree that manifest, notebooks and functions share.
 
-`python -m toolkit settings` prints the tree. The sentence under each field is its only documentation.
+`visloc settings` prints the tree. The sentence under each field is its only documentation.
 """
 
 import math

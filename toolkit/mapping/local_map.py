@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from toolkit import geometry
 from toolkit.capture.cameras import camera_text, parse_camera, projection_jacobian
-from toolkit.errors import ArtifactError
+from toolkit.errors import COMMAND, ArtifactError
 from toolkit.files import require_whole, write_atomic
 from toolkit.geometry import Floats, Ints
 
@@ -62,7 +62,7 @@ class Consistency:
             if self.fits.startswith(("rotations of cam_from_world", "camera centers that were")):
                 cause += " If imported from a table: give `--poses-are rotation_of_cam_from_world`."
             if OPENGL_AXES in self.fits:
-                cause += " If imported: give the other `--axes`, opencv or opengl, to `python -m toolkit import`."
+                cause += f" If imported: give the other `--axes`, opencv or opengl, to `{COMMAND} import`."
             agree = f"{self.agreeing} of {self.pairs} image pairs with verified matches agree with the poses"
             return f"the poses of the map contradict its images: {agree}. {cause}"
         if self.camera:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from toolkit.capture import Capture
 from toolkit.capture.devices import extra_devices
 from toolkit.capture.names import allow_outside
-from toolkit.errors import ArtifactError, ToolkitError
+from toolkit.errors import COMMAND, ArtifactError, ToolkitError
 from toolkit.figures.query_images import draw_localization
 from toolkit.figures.style import BLUE, GREEN, ORANGE, SKY, VERMILLION, new_figure, number, percent, styled
 from toolkit.files import SceneFiles, require_current, require_whole
@@ -222,7 +222,7 @@ def _read_errors(folder: Path, record: Mapping[str, Any]) -> pd.DataFrame:
         tables.append(table.assign(scene=scene))
     if not tables:
         missing = f"{next(iter(paths.values()))} is missing" if paths else "its run.json names no scene"
-        raise ArtifactError(f"{folder}: not evaluated ({missing}). Finish the run: python -m toolkit run MANIFEST.")
+        raise ArtifactError(f"{folder}: not evaluated ({missing}). Finish the run: {COMMAND} run MANIFEST.")
     errors = pd.concat(tables, ignore_index=True).dropna(subset=_ERRORS)
     if errors.empty:
         raise ArtifactError(
@@ -364,16 +364,22 @@ def _readable_recall(comparison: Comparison) -> pd.DataFrame:
 
 
 def _readable_changes(comparison: Comparison) -> pd.DataFrame:
-    """List the queries won and lost, or a regular sample of `MAX_ROWS` of them."""
+    """List the queries won and lost, or a regular sample of `MAX_ROWS` of them, with the folders of their captures."""
     table, unit = comparison.changes, unit_of(*comparison.thresholds)
-    columns = ["run", "change", "at", "query", f"off in {comparison.names[0]}", "off in the run", "status", "image"]
+    columns = [
+        *("run", "change", "at", "pair", f"off in {comparison.names[0]}", "off in the run", "status", "image"),
+        "sessions_root",
+    ]
+    stages = comparison.records[0]["stages"]
+    roots = {stage.get("scene"): stage.get("parameters", {}).get("sessions_root") for stage in stages}
     rows = []
     for row in table.loc[_spread(range(len(table)), MAX_ROWS)].to_dict("records"):
-        i, query = comparison.names.index(row["run"]), f"{row['query_device']} in {row['map_device']} map"
+        i, pair = comparison.names.index(row["run"]), f"{row['query_device']} in {row['map_device']}"
         off = (off_by(row, after=f"_{k}", unit=unit) for k in (0, i))
         status, at = row[f"status_{i}"].replace("_", " "), _limits(comparison, row["at"])
-        rows.append((row["run"], row["change"], at, query, *off, status, _name(row)))
-    return pd.DataFrame(rows, columns=columns).set_index("run")
+        root = roots.get(row["scene"])
+        rows.append((row["run"], row["change"], at, pair, *off, status, row["image"], root and Path(root)))
+    return pd.DataFrame(rows, columns=columns)
 
 
 def draw_changes(comparison: Comparison, most: int) -> "Iterator[tuple[str, list[tuple[str, Figure]]]]":

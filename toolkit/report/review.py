@@ -1,6 +1,7 @@
 """What a reviewer asks of a run: its main table, also as CSV and LaTeX, its maps, and its method in words."""
 
 import math
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -27,6 +28,7 @@ NAMES = {
 }  # fmt: skip
 """What papers call the parts that settings name."""
 LATEX = {"°": r"\textdegree{}", "\N{NO-BREAK SPACE}": "~", "–": "--", "∞": r"$\infty$"}
+FIT = r"\footnotesize\setlength{\tabcolsep}{3pt}\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{"
 
 
 class Interval(NamedTuple):
@@ -82,7 +84,7 @@ def readable(table: pd.DataFrame, thresholds: Sequence[str]) -> pd.DataFrame:
 
 
 def write_tables(stem: Path, table: pd.DataFrame, shown: pd.DataFrame, caption: str) -> list[Path]:
-    """Write the main table as `<stem>.csv`, in numbers, and as `<stem>.tex`, for the package booktabs.
+    """Write the main table as `<stem>.csv`, in numbers, and as `<stem>.tex`, which is no wider than the page.
 
     Args:
         table: the main table, see `main_table`.
@@ -94,14 +96,29 @@ def write_tables(stem: Path, table: pd.DataFrame, shown: pd.DataFrame, caption: 
         for path in paths:
             path.unlink(missing_ok=True)
         return []
-    style = shown.style.hide(axis="index").format(escape="latex").format_index(escape="latex", axis="columns")
-    columns, escaped = "ll" + "r" * (len(shown.columns) - 2), caption.replace("%", r"\%")
-    text = style.to_latex(hrules=True, caption=escaped, label=f"tab:{stem.name}", column_format=columns)
+    style = shown.style.hide(axis="index").format(escape="latex").format_index(_heading, axis="columns")
+    columns, label = "ll" + "r" * (len(shown.columns) - 2), re.sub(r"[^\w.:-]", "-", f"tab:{stem.name}")
+    text = style.to_latex(
+        hrules=True, column_format=columns, caption=_escaped(caption), label=label, environment="table*",
+        position_float="centering",
+    )  # fmt: skip
     for letter, command in LATEX.items():
         text = text.replace(letter, command)
+    text = text.replace(r"\begin{tabular}", f"{FIT}%\n\\begin{{tabular}}").replace(r"\end{tabular}", "\\end{tabular}}")
     write_text(paths[0], table.to_csv(index=False, float_format="%.6g"))
-    write_text(paths[1], f"% \\usepackage{{booktabs}}\n{text}")
+    write_text(paths[1], f"% \\usepackage{{booktabs,graphicx}}\n{text}")
     return paths
+
+
+def _escaped(text: str) -> str:
+    return re.sub(r"([%&#_{}$])", r"\\\1", text)
+
+
+def _heading(text: str) -> str:
+    """Return a heading of a column in LaTeX, in lines that are as short as the numbers below it."""
+    lines = [_escaped(line) for line in re.split(r"(?<!°,) (?!%)", text)]
+    # In braces, as `\\[1]` is a distance between lines.
+    return lines[0] if len(lines) == 1 else "\\shortstack[r]{{" + "}\\\\{".join(lines) + "}}"
 
 
 def maps_table(files: SceneFiles) -> pd.DataFrame:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import h5py
 
 from toolkit.capture import Capture, Session
-from toolkit.errors import ArtifactError, ManifestError, ToolkitError
+from toolkit.errors import COMMAND, ArtifactError, ManifestError, ToolkitError
 from toolkit.features.matching import LocalMethod
 from toolkit.features.stores import FeatureStore
 from toolkit.files import SceneFiles, file_fingerprint, fingerprint, pair_devices, write_atomic
@@ -23,7 +23,7 @@ from toolkit.store.hdf5 import HDF5_ERRORS
 SETTINGS, SESSIONS_ROOT, RETRIEVAL = "settings", "sessions_root", "retrieval_dir"
 """Attributes of `poses/<pair>.h5`: the settings that the pair was localized with, the `sessions` folder of the capture,
 and the folder of the references."""
-_FIRST = "Localize first: python -m toolkit run MANIFEST, or build the map alone: add --only map."
+_FIRST = f"Localize first: {COMMAND} run MANIFEST, or build the map alone: add --only map."
 
 
 def no_such_run(run: Path) -> ArtifactError:

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from toolkit.capture import Capture
-from toolkit.errors import OF_THE_DATA, ArtifactError, ToolkitError
+from toolkit.errors import COMMAND, OF_THE_DATA, ArtifactError, ToolkitError
 from toolkit.figures.answers import Answer
 from toolkit.figures.query_images import shown_name
 from toolkit.files import SceneFiles, image_name, pair_devices, read_references, require_current
@@ -63,7 +63,7 @@ class InspectedPair:
             raise ArtifactError(
                 f"{poses_dir}: no correspondences of queries of {query_device!r} in the map of {map_device!r}, "
                 f"`<pair>.h5`. {nearest(f'{query_device} in {map_device}', known)} Localize first: "
-                "python -m toolkit run MANIFEST."
+                f"{COMMAND} run MANIFEST."
             )
         self.map_device, self.label = map_device, f"{query_device} in the map of {map_device}"
         self._h5 = pairs[map_device, query_device]
@@ -172,6 +172,16 @@ class WorstQueries:
         order = worst_first(pd.concat(tables, ignore_index=True)).tolist() if queries else []
         self._queries = [queries[k] for k in order]
         self.names = [f"{pair.label}: {shown_name(pair.names[number])}" for pair, number in self._queries]
+
+    def table(self, most: int = 12) -> pd.DataFrame:
+        """Return the worst: devices, status, inliers, errors (NaN without a pose or a true one), names of images."""
+        errors = ["rotation_error_deg", "translation_error_m"]
+        columns = ["map_device", "query_device", "status", "num_inliers", *errors, "image"]
+        rows = []
+        for pair, number in self._queries[:most]:
+            devices = dict(zip(columns, pair_devices(pair._h5.stem), strict=False))
+            rows.append({**pair.localized.localizations.errors.iloc[number].to_dict(), **devices})
+        return pd.DataFrame(rows).reindex(columns=columns).replace(np.inf, np.nan)
 
     def look(self, rank: int | str = 0) -> Answer:
         """Return a query by its rank, 0 for the worst of all, or by the name of one of its images.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pycolmap
 
-from toolkit.errors import ArtifactError, ManifestError
+from toolkit.errors import COMMAND, ArtifactError, ManifestError
 from toolkit.geometry import Floats
 from toolkit.manifest import nearest
 from toolkit.manifest.loading import nested
@@ -122,7 +122,7 @@ class Located:
         for section in sections.keys() - {"localize", "retrieve"}:
             raise ManifestError(
                 f"{section}: cannot change for one query. {nearest(section, CHANGEABLE)} "
-                f"To change it for all queries: python -m toolkit run MANIFEST --set {section}..."
+                f"To change it for all queries: {COMMAND} run MANIFEST --set {section}..."
             )
         retrieval = dict(sections.get("retrieve", {}))
         k = retrieval.pop("topk", None)

@@ -2,6 +2,7 @@
 
 import copy
 import logging
+import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -19,7 +20,7 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, masks
 from toolkit.capture.images import thumbnails
 from toolkit.capture.upright import Turns, upright_turns
-from toolkit.errors import ArtifactError, CameraError, ImageError, ManifestError, reason_of
+from toolkit.errors import COMMAND, ArtifactError, CameraError, ImageError, ManifestError, reason_of
 from toolkit.features.features import KINDS
 from toolkit.features.matching import (
     AnyMethod,
@@ -553,11 +554,14 @@ class Map:
         if "kinds" in features and "escalation" not in features:
             rest = [name for name in before.features.escalation if name not in features["kinds"]]
             changes |= {"features": {**features, "escalation": rest}}
-        settings = LocalizeSettings.of(before, changes)
+        try:
+            settings = LocalizeSettings.of(before, changes)
+        except ManifestError as error:
+            raise ManifestError(re.sub(r"^\w+:\s+", "localize: ", str(error))) from None
         if fixed := [name for name in FIXED_BY_MAP if getattr(settings, name) != getattr(before, name)]:
             raise ManifestError(
                 f"localize.{fixed[0]}: cannot change for one query, as the whole map depends on it. "
-                f"To change it: python -m toolkit run MANIFEST --set localize.{fixed[0]}=..."
+                f"To change it: {COMMAND} run MANIFEST --set localize.{fixed[0]}=..."
             )
         other = copy.copy(self)
         other.settings, other.original = settings, self._first

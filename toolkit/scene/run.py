@@ -10,7 +10,7 @@ import pandas as pd
 
 from toolkit.capture import Capture, Session
 from toolkit.capture.devices import in_order
-from toolkit.errors import ArtifactError
+from toolkit.errors import COMMAND, ArtifactError
 from toolkit.files import SceneFiles, pair_devices, read_json, relative_url, why_older
 from toolkit.geometry import Ints
 from toolkit.pose.base import Query
@@ -30,10 +30,10 @@ class Page:
     @classmethod
     def of(cls, path: Path) -> "Page":
         if not path.is_file():
-            raise ArtifactError.at(path, "no such page", do="Finish the run: python -m toolkit run MANIFEST.")
+            raise ArtifactError.at(path, "no such page", do=f"Finish the run: {COMMAND} run MANIFEST.")
         if older := why_older(path, "report"):
             found = older.partition(":")[0]
-            raise ArtifactError.at(path, found, do=f"Write it again: python -m toolkit report {path.parent}.")
+            raise ArtifactError.at(path, found, do=f"Write it again: {COMMAND} report {path.parent}.")
         return cls(path)
 
     def _repr_html_(self) -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from toolkit.capture import Session
-from toolkit.errors import ArtifactError
+from toolkit.errors import COMMAND, ArtifactError
 from toolkit.features.stores import FeatureStore, MatchStore, features_path
 from toolkit.files import image_name, read_references
 from toolkit.geometry import Ints
@@ -49,7 +49,7 @@ class StoredQueries:
         if missing := [path for path in paths if not path.exists()]:
             raise ArtifactError(
                 f"{missing[0]}: no features of the queries. A run with the method `feed_forward` extracts none. To "
-                "change its method: python -m toolkit run MANIFEST --set localize.method=hybrid"
+                f"change its method: {COMMAND} run MANIFEST --set localize.method=hybrid"
             )
         self.stores = [FeatureStore.open(path) for path in paths]
 

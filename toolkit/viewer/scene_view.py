@@ -91,7 +91,7 @@ class View3D:
             if self.rays and is_posed(camera.world_from_cam):
                 rays.append((camera.world_from_cam[:3, 3], camera.points[camera.inlier]))
         up = np.asarray(up_of_cameras(self._poses) if self.world_up is None else self.world_up, np.float64)
-        eye = Eye.of(self._poses, up, cameras[0][0] if cameras else None).farther(1.4)
+        eye = Eye.of(self._poses, up, [pose for pose, _, _ in cameras]).farther(1.4)
         size, points = camera_depth_m(self._poses[:, :3, 3]), self._cloud[0]
         title = f"map of {self.map_session.device}: {len(self._poses)} images, {len(points)} points"
         return draw_scene_3d(*self._cloud, self._poses, eye, size, cameras, rays, title)
