@@ -63,8 +63,13 @@ def bounded_by_rivals(probability: float, supports: Sequence[float]) -> float:
         probability: that of the pose alone, see `probability_right`.
         supports: of the rivals, relative to that of the pose.
     """
+    return float(min(probability, 1 / (1 + odds_of_rivals(supports).sum())))
+
+
+def odds_of_rivals(supports: Sequence[float]) -> Floats:
+    """Return how probable each rival is, relative to the pose, from its relative support: 1 for equal support."""
     relative = np.clip(np.array(supports, np.float64), 1e-3, 1.0)
-    return float(min(probability, 1 / (1 + np.exp(-RIVAL_SLOPE * (1 / relative - 1)).sum())))
+    return np.asarray(np.exp(-RIVAL_SLOPE * (1 / relative - 1)), np.float64)
 
 
 def terms(evidence: Mapping[str, Floats | float]) -> Floats:

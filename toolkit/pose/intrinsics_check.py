@@ -208,8 +208,7 @@ def _change(stated: pycolmap.Camera, other: pycolmap.Camera, parameters: Floats)
 
 def _motion(start: "_Estimate", end: "_Estimate") -> Floats:
     """Return `Misfit.shift` (6,) from one pose to another."""
-    motion = start.rig_from_world @ geometry.invert(end.rig_from_world)
-    return np.concatenate([Rotation.from_matrix(motion[:3, :3]).as_rotvec(), motion[:3, 3]])
+    return geometry.small_motions((start.rig_from_world @ geometry.invert(end.rig_from_world))[None])[0]
 
 
 class _Estimate(NamedTuple):

@@ -21,14 +21,20 @@ from toolkit.alignment.robust import Bools
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import PnpSettings
 from toolkit.pose.base import Localizer, Prior, Query, QueryMatches, References
-from toolkit.pose.confidence import EVIDENCE, bounded_by_deviation, bounded_by_rivals, probability_right
+from toolkit.pose.confidence import (
+    EVIDENCE,
+    bounded_by_deviation,
+    bounded_by_rivals,
+    odds_of_rivals,
+    probability_right,
+)
 from toolkit.pose.intrinsics_check import find_misfit
 from toolkit.pose.map_matching import MapMatcher, MappedFeatures, MatchCache, Vicinity
 from toolkit.pose.result import CAMERA, Correspondences, QueryResult, Rival, Status, agree
 from toolkit.pose.rig import CELLS, Matches, RigQuery, least_squares_covariance
 from toolkit.threads import fixed_sums
 
-PNP_FORMAT = 6
+PNP_FORMAT = 7
 """Version of the poses. Increase when the same settings and files give other poses."""
 FIRST_REFERENCES = {2: 200, 4: 100}
 """Number of references per image to match first -> independent inliers that their pose needs to be kept. The next
@@ -47,6 +53,12 @@ together can outvote the one reference that shows the right place."""
 CLOSE = 0.35
 """Of `max_error_deg`: correct matches fit their pose so closely, matches of one window with the next do not. By a limit
 that both keep, a pose that is off by a window can have more inliers than the correct one, and hide it."""
+WIDE_RADIUS_DEG = 1.5
+"""Guided matching as far around a doubtful pose as a neighboring window may be: the best descriptors there are mostly
+those of the right window, far more of them than among the matches by descriptors alone."""
+RIVAL_DISTANCE, NEAR_DISTANCE = 0.5, 0.05
+"""Of what a right pose may be off: poses farther apart than the first are rivals; between poses that are farther apart
+than the second, the pose is uncertain."""
 MAX_RIVAL_SUPPORT = 0.8
 """A pose is `ok` only if the best rival pose has at most this fraction of its support. With the default
 `ok_probability` the limit is 0.7, see `confidence.py`."""
@@ -71,9 +83,7 @@ class _Hypothesis:
     rig_from_world: Floats
     matches: Matches
     support: float
-    """Sum over the matches of 1 - (error / `max_error_deg`)^2, at least 0 each, as in MSAC (Torr and Zisserman, CVIU
-    2000). Guided matches are searched near the projections of the map, so a wrong pose near the right one may have as
-    many, but with larger errors."""
+    """How well the matches fit, see `_support`."""
 
     @property
     def world_from_rig(self) -> Floats:
@@ -280,8 +290,9 @@ class PnpLocalizer(Localizer):
 
         With repeated structure (a row of similar windows), many descriptors agree with several poses, and RANSAC may
         find one of them or something in between. So unless the first pose is clear, search for others: with a tighter
-        threshold, among the outliers of the first, and among the matches of single references. The number and errors
-        of guided matches decide: only at the correct pose does the rest of the map project where the query shows it.
+        threshold, among the outliers of the first, among the matches of single references, and by closely fitting
+        matches in a wide surrounding of the best. The number and errors of guided matches decide: only at the correct
+        pose does the rest of the map project where the query shows it.
         """
         settings = self.settings
         hypotheses = [self._improve(query, start, matches)]
@@ -309,18 +320,29 @@ class PnpLocalizer(Localizer):
     def _add_other_places(
         self, query: RigQuery, matches: Matches, references: Sequence[References], hypotheses: list[_Hypothesis]
     ) -> None:
-        """Add clearly different poses, found from the matches with single references, or by closely fitting ones."""
+        """Add different poses, found from the matches with single references, or around the best pose so far."""
         images = dict.fromkeys(int(index) for retrieved in references for index in retrieved.images)
         seen_in = {index: np.isin(matches.point, self.map.observations(index)[1]) for index in images}
         best = sorted(seen_in, key=lambda index: -int(seen_in[index].sum()))
         limit_deg, close_deg = self.settings.ransac_max_error_deg, CLOSE * self.settings.max_error_deg
-        searches = [(matches[seen_in[index]], limit_deg, 5, 1.0) for index in best[: CONTESTED_REFERENCES]]
-        for some, max_error_deg, least, share in [*searches, (matches, close_deg, 0, 0.5)]:
-            start = self._ransac(query, some, max_error_deg, least_inliers=least)
-            if start is not None and not any(
-                agree(hypothesis.world_from_rig, geometry.invert(start), share) for hypothesis in hypotheses
-            ):
-                hypotheses.append(self._improve(query, start, matches))
+        for index in best[:CONTESTED_REFERENCES]:
+            start = self._ransac(query, matches[seen_in[index]], limit_deg, least_inliers=5)
+            self._add(query, matches, hypotheses, start, 1.0)
+        pose = max(hypotheses, key=lambda hypothesis: hypothesis.support).rig_from_world
+        covisible = self.matcher.covisible(np.unique(matches.point[self._inliers(query, pose, matches)]))
+        vicinity = self.matcher.vicinity(query, pose, covisible, WIDE_RADIUS_DEG)
+        around = vicinity.guided(pose, WIDE_RADIUS_DEG, MAX_GUIDED_MATCHES)
+        # Even a pose 0.1 m away may be the better of two.
+        self._add(query, matches, hypotheses, self._ransac(query, around, close_deg), 0.2)
+
+    def _add(
+        self, query: RigQuery, matches: Matches, hypotheses: list[_Hypothesis], start: Floats | None, share: float
+    ) -> None:
+        """Add the pose refined from `start`, unless it agrees with one that is there, see `agree`."""
+        if start is None:
+            return
+        if not any(agree(one.world_from_rig, geometry.invert(start), share) for one in hypotheses):
+            hypotheses.append(self._improve(query, start, matches))
 
     def _independent(self, inliers: Matches) -> int:
         """Return the number of independent inliers: those that share a point or a keypoint count once."""
@@ -329,8 +351,10 @@ class PnpLocalizer(Localizer):
         return min(len(np.unique(inliers.point)), keypoints)
 
     def _inliers(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> NDArray[np.bool_]:
-        errors = query.errors_deg(rig_from_world, matches, self.map.points)
-        return errors < self.settings.ransac_max_error_deg
+        return self._errors(query, rig_from_world, matches) < self.settings.ransac_max_error_deg
+
+    def _errors(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> Floats:
+        return query.errors_deg(rig_from_world, matches, self.map.points)
 
     def _improve(self, query: RigQuery, rig_from_world: Floats, matches: Matches) -> _Hypothesis:
         """Alternate between guided matching around the pose and refinement, while enough matches support it."""
@@ -350,8 +374,7 @@ class PnpLocalizer(Localizer):
             if len(guided) < min_matches:
                 break
             pose, inliers = query.refine(refined, guided, self.map.points, close=True), guided
-        errors = query.errors_deg(pose, inliers, self.map.points) / settings.max_error_deg
-        return _Hypothesis(pose, inliers, float(np.maximum(1 - errors**2, 0).sum()))
+        return _Hypothesis(pose, inliers, _support(self._errors(query, pose, inliers), settings.max_error_deg))
 
     def _estimate(
         self, query: RigQuery, matches: Matches, hypotheses: list[_Hypothesis], references: Sequence[References]
@@ -375,10 +398,11 @@ class PnpLocalizer(Localizer):
         images = np.unique(np.concatenate([retrieved.images for retrieved in references]))
         seen = self.map.images_seeing(np.unique(all_matches.point[agreeing]))[images]
         used = [int(images[index]) for index in np.argsort(-seen, kind="stable") if seen[index]]
+        covariance = self._covariance(query, rig_from_world, guided, np.isin(guided.rows(), inliers.rows()))
         estimate = QueryResult(
             Status.OK,
             world_from_rig=geometry.invert(rig_from_world),
-            covariance=self._covariance(query, rig_from_world, guided, np.isin(guided.rows(), inliers.rows())),
+            covariance=None if covariance is None else covariance + self._spread(hypotheses),
             num_matches=len(matches),
             num_inliers=independent,
             num_guided=len(guided),
@@ -456,22 +480,42 @@ class PnpLocalizer(Localizer):
         rejected = self._correspondences(matches, np.zeros(len(matches), bool), 0, [])
         return QueryResult.failed(reason, num_matches=len(matches), num_inliers=inliers, correspondences=rejected)
 
-    def _rivals(self, hypotheses: list[_Hypothesis]) -> list[Rival]:
-        """Return the poses that clearly differ from the best and from each other, with their relative support."""
+    def _rivals(self, hypotheses: list[_Hypothesis], distance: float = RIVAL_DISTANCE) -> list[Rival]:
+        """Return the poses that differ from the best and from each other, with their support relative to the best's."""
         kept = hypotheses[:1]
         for other in hypotheses[1:]:
-            if all(_differ(one, other) for one in kept):
+            if not any(agree(one.world_from_rig, other.world_from_rig, distance) for one in kept):
                 kept.append(other)
         support = max(hypotheses[0].support, np.finfo(float).tiny)
         return [Rival(other.world_from_rig, other.support / support) for other in kept[1:]]
+
+    def _spread(self, hypotheses: list[_Hypothesis]) -> Floats:
+        """Return the covariance (6, 6) due to poses with similar support that are too near to the best to be rivals."""
+        best = hypotheses[0]
+        near = [one for one in self._rivals(hypotheses, NEAR_DISTANCE) if not _differ(best, one)]
+        odds = odds_of_rivals([one.support for one in near])
+        poses = np.reshape([one.world_from_rig for one in near], (-1, 4, 4))
+        shifts = geometry.small_motions(best.rig_from_world @ poses) if near else np.zeros((0, 6))
+        return np.asarray((shifts.T * (odds / (1 + odds.sum()))) @ shifts, np.float64)
 
     def _ransac(self, query: RigQuery, matches: Matches, max_error_deg: float, least_inliers: int = 0) -> Floats | None:
         return query.ransac(matches, self.map.points, max_error_deg, self.seed, least_inliers)
 
 
-def _differ(hypothesis: _Hypothesis, other: _Hypothesis) -> bool:
-    """Tell whether two hypotheses are clearly different poses: by more than half of what a right pose may be off."""
-    return not agree(hypothesis.world_from_rig, other.world_from_rig, share=0.5)
+def _support(errors_deg: Floats, max_error_deg: float) -> float:
+    """Return how well a pose is supported by n matches that it was fitted to.
+
+    The sum of 1 - (error / limit)^2, at least 0 each, as in MSAC (Torr and Zisserman, CVIU 2000): the geometric mean
+    for two limits. Guided matches are searched near the projections of the map, so a wrong pose near the right one may
+    have as many or more, but with larger errors. Three of the matches do not count, as six parameters fit any three.
+    """
+    sums = [np.maximum(1 - (errors_deg / limit) ** 2, 0).sum() for limit in (max_error_deg, CLOSE * max_error_deg)]
+    return float(np.sqrt(np.prod(sums)) * max(1 - 3 / max(len(errors_deg), 1), 0))
+
+
+def _differ(hypothesis: _Hypothesis, other: _Hypothesis | Rival) -> bool:
+    """Tell whether two hypotheses are clearly different poses."""
+    return not agree(hypothesis.world_from_rig, other.world_from_rig, RIVAL_DISTANCE)
 
 
 def _of_all_images(matches: PnpMatches, result: QueryResult, missing: str) -> QueryResult:
