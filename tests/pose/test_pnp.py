@@ -23,7 +23,7 @@ from toolkit.pose import pnp
 from toolkit.pose.base import Prior, References
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import FIRST_REFERENCES, GUIDED_WEIGHT, VIEWS, PnpLocalizer, _Hypothesis, _support
-from toolkit.pose.result import CAMERA, QueryResult
+from toolkit.pose.result import CAMERA, QueryResult, Status
 from toolkit.pose.rig import Matches, RigQuery, least_squares_covariance
 
 Floats = NDArray[np.float64]
@@ -380,6 +380,19 @@ def test_a_prior_confirms_the_doubtful_pose_that_it_leads_to(
     np.testing.assert_allclose(confirmed.world_from_rig, alone.world_from_rig, atol=1e-5)
 
 
+def test_a_prior_is_kept_as_a_rival_where_ransac_leaves_it(room: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where windows repeat, and the pose off by one of them has more matches within RANSAC's limit."""
+    localizer, wrong = room.localizer(), geometry.invert(QUERY @ facing(0.3, 0, 0))
+    query = RigQuery([PINHOLE], np.eye(4)[None], [[room.look(PINHOLE, QUERY)]])
+    judged: list[_Hypothesis] = []
+    monkeypatch.setattr(localizer, "_ransac", lambda *_, **__: wrong)
+    monkeypatch.setattr(localizer, "_estimate", lambda _, __, hypotheses, *___: judged.extend(hypotheses))
+    none, estimate = Matches.pooled([]), QueryResult(Status.LOW_CONFIDENCE, world_from_rig=geometry.invert(wrong))
+    prior = Prior(QUERY, np.array(REFERENCES), 2.0, "first")
+    localizer._compare(query, none, [_Hypothesis(wrong, none, 1e4)], estimate, [References.of(REFERENCES)], prior)
+    assert min(geometry.pose_error(one.world_from_rig, QUERY)[1] for one in judged) < 0.01
+
+
 def test_a_prior_without_support_gives_no_pose(room: World) -> None:
     """Its few matches are all wrong."""
     seen = replace(room, rng=np.random.default_rng(0)).look(PINHOLE, QUERY, limit=8, outliers=1.0)
@@ -477,7 +490,7 @@ def test_a_pose_off_by_a_window_does_not_hide_the_one_that_fewer_matches_fit_clo
     assert first is not None
     assert geometry.pose_error(geometry.invert(first), wrong)[1] < 0.1
     hypotheses = [_Hypothesis(first, matches, 10.0)]
-    localizer._add_other_places(query, matches, [References.of([0])], hypotheses)
+    localizer._add_neighbor(query, matches, hypotheses)
     assert min(geometry.pose_error(one.world_from_rig, QUERY)[1] for one in hypotheses[1:]) < 0.02
 
 

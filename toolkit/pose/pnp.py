@@ -229,7 +229,9 @@ class PnpLocalizer(Localizer):
         start = self._ransac(query, near, self.settings.ransac_max_error_deg) if len(near) else None
         if start is None:
             return estimate
-        hypothesis = self._improve(query, start, near)
+        # Where windows repeat, RANSAC may leave a prior that is a rival for a neighboring window.
+        found = _best_first([self._improve(query, pose, near) for pose in (start, rig_from_world)])
+        hypothesis = found[0]
         same = bool(hypotheses) and not _differ(hypotheses[0], hypothesis)
         support = hypotheses[0].support if hypotheses else 0.0
         clearly_more = support <= MAX_RIVAL_SUPPORT * hypothesis.support  # a tie keeps the first estimate
@@ -242,10 +244,9 @@ class PnpLocalizer(Localizer):
             if with_prior.world_from_rig is not None and (not same or lost or with_prior.status is Status.OK):
                 return replace(with_prior, found_by=f"pnp+{prior.source}")
             return estimate
-        if same or estimate.world_from_rig is None:
+        if estimate.world_from_rig is None or not any(_differ(hypotheses[0], one) for one in found):
             return estimate
-        rivals = sorted([*hypotheses, hypothesis], key=lambda rival: -rival.support)
-        return self._estimate(query, matches, rivals, references)
+        return self._estimate(query, matches, _best_first([*hypotheses, *found]), references)
 
     def _first_pose(
         self, of_query: PnpMatches, references: Sequence[References]
@@ -315,25 +316,29 @@ class PnpLocalizer(Localizer):
                 hypotheses.append(self._improve(query, other, matches))
         if share < CONTESTED_INLIER_RATIO:
             self._add_other_places(query, matches, references, hypotheses)
-        return sorted(hypotheses, key=lambda hypothesis: -hypothesis.support)
+        self._add_neighbor(query, matches, hypotheses)
+        return _best_first(hypotheses)
 
     def _add_other_places(
         self, query: RigQuery, matches: Matches, references: Sequence[References], hypotheses: list[_Hypothesis]
     ) -> None:
-        """Add different poses, found from the matches with single references, or around the best pose so far."""
+        """Add clearly different poses, found from the matches with single references."""
         images = dict.fromkeys(int(index) for retrieved in references for index in retrieved.images)
         seen_in = {index: np.isin(matches.point, self.map.observations(index)[1]) for index in images}
         best = sorted(seen_in, key=lambda index: -int(seen_in[index].sum()))
-        limit_deg, close_deg = self.settings.ransac_max_error_deg, CLOSE * self.settings.max_error_deg
         for index in best[:CONTESTED_REFERENCES]:
-            start = self._ransac(query, matches[seen_in[index]], limit_deg, least_inliers=5)
+            some = matches[seen_in[index]]
+            start = self._ransac(query, some, self.settings.ransac_max_error_deg, least_inliers=5)
             self._add(query, matches, hypotheses, start, 1.0)
-        pose = max(hypotheses, key=lambda hypothesis: hypothesis.support).rig_from_world
+
+    def _add_neighbor(self, query: RigQuery, matches: Matches, hypotheses: list[_Hypothesis]) -> None:
+        """Add the pose that fits most closely around the best so far; even one 0.1 m away may be the better of two."""
+        pose = _best_first(hypotheses)[0].rig_from_world
         covisible = self.matcher.covisible(np.unique(matches.point[self._inliers(query, pose, matches)]))
         vicinity = self.matcher.vicinity(query, pose, covisible, WIDE_RADIUS_DEG)
         around = vicinity.guided(pose, WIDE_RADIUS_DEG, MAX_GUIDED_MATCHES)
-        # Even a pose 0.1 m away may be the better of two.
-        self._add(query, matches, hypotheses, self._ransac(query, around, close_deg), 0.2)
+        start = self._ransac(query, around, CLOSE * self.settings.max_error_deg)
+        self._add(query, matches, hypotheses, start, 0.2)
 
     def _add(
         self, query: RigQuery, matches: Matches, hypotheses: list[_Hypothesis], start: Floats | None, share: float
@@ -511,6 +516,10 @@ def _support(errors_deg: Floats, max_error_deg: float) -> float:
     """
     sums = [np.maximum(1 - (errors_deg / limit) ** 2, 0).sum() for limit in (max_error_deg, CLOSE * max_error_deg)]
     return float(np.sqrt(np.prod(sums)) * max(1 - 3 / max(len(errors_deg), 1), 0))
+
+
+def _best_first(hypotheses: Sequence[_Hypothesis]) -> list[_Hypothesis]:
+    return sorted(hypotheses, key=lambda hypothesis: -hypothesis.support)
 
 
 def _differ(hypothesis: _Hypothesis, other: _Hypothesis | Rival) -> bool:
