@@ -38,9 +38,7 @@ except ModuleNotFoundError as missing:  # users may run `python -m toolkit` with
     ) from None
 
 app = typer.Typer(
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    no_args_is_help=True, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
 )
 
 
@@ -147,9 +145,7 @@ def run(
         if sweeps and (name or in_place):
             raise ManifestError("--sweep names its runs itself: leave out --name and --in-place.")
         if sweeps:
-            _compare_swept(
-                *pipeline.sweep(path, sweeps, overrides or (), tell, only, force, cluster), tell, as_json
-            )
+            _compare_swept(*pipeline.sweep(path, sweeps, overrides or (), tell, only, force, cluster), tell, as_json)
             return
         run_dir = pipeline.run(path, only, force, overrides or (), tell, cluster, name, in_place)
     except BaseException as error:

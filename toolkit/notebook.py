@@ -123,9 +123,7 @@ class Folders(SimpleNamespace):
         return "\n".join(f"{name:<{max(map(len, folders))}}  {path}" for name, path in folders.items())
 
 
-def start(
-    stage: str, sessions_root: str | None = None, run: str | None = None, **folders: str | None
-) -> Folders:
+def start(stage: str, sessions_root: str | None = None, run: str | None = None, **folders: str | None) -> Folders:
     """Resolve the folders of a notebook; check its parameters.
 
     Args:
@@ -465,9 +463,7 @@ def _finished_run(runs: Path, scene: str) -> Path | None:
     return max(with_scene, key=lambda run: (run.name == scene, str(records[run].get("created"))), default=None)
 
 
-def _make_upstream(
-    stage: str, sessions: Path, files: SceneFiles, folders: set[Path | None], run: Path | None
-) -> None:
+def _make_upstream(stage: str, sessions: Path, files: SceneFiles, folders: set[Path | None], run: Path | None) -> None:
     """Run the earlier stages whose results `stage` needs and whose folder is in `folders` and empty or absent."""
     for name in UPSTREAM[stage]:
         folder = files.of_stage(name)
@@ -740,7 +736,6 @@ def execute(
     # Imported here because that takes seconds, which a run that reuses everything does not need.
     import papermill
     from papermill.exceptions import PapermillExecutionError
-
 
     try:
         notebook = papermill.execute_notebook(

@@ -163,9 +163,7 @@ def _set_images(model: ColmapModel, rows: Mapping[int, tuple[str, int, Sequence[
         model.images[image_id] = ModelImage(name, camera_id, pose)
 
 
-def _camera(
-    model_name: str, size: Sequence[Any], params: Sequence[Any], where: str = ""
-) -> pycolmap.Camera | str:
+def _camera(model_name: str, size: Sequence[Any], params: Sequence[Any], where: str = "") -> pycolmap.Camera | str:
     try:
         return parse_camera("camera", ", ".join([model_name, *map(str, size), *map(str, params)]))
     except ValueError as error:

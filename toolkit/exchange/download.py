@@ -46,10 +46,7 @@ _WORKERS = 8  # threads for small files, which mostly wait for the network; arch
 
 
 def download(
-    manifest_path: str | Path,
-    sessions: Sequence[str] = (),
-    dry_run: bool = False,
-    overrides: Iterable[str] = (),
+    manifest_path: str | Path, sessions: Sequence[str] = (), dry_run: bool = False, overrides: Iterable[str] = ()
 ) -> "list[CheckReport]":
     """Download the captures of a manifest into their folders, check them, and print what is done.
 

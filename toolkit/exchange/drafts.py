@@ -56,16 +56,7 @@ from toolkit.exchange.recordings import (
     read_track,
     to_us,
 )
-from toolkit.files import (
-    IMPORTED,
-    MASKS,
-    own_name,
-    read_json,
-    recover_folder,
-    write_atomic,
-    write_folder,
-    write_text,
-)
+from toolkit.files import IMPORTED, MASKS, own_name, read_json, recover_folder, write_atomic, write_folder, write_text
 from toolkit.geometry import Floats, make_pose, scaled
 from toolkit.manifest import nearest
 

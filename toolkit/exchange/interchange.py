@@ -23,12 +23,7 @@ from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.images import decode, exif_camera
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import COMMAND, CaptureError, ImageError, ManifestError
-from toolkit.exchange.colmap_model import (
-    NORM_TOLERANCE,
-    inverse,
-    read_cameras,
-    read_model,
-)
+from toolkit.exchange.colmap_model import NORM_TOLERANCE, inverse, read_cameras, read_model
 from toolkit.exchange.drafts import (
     HEIC_SUFFIXES,
     READ_SUFFIXES,

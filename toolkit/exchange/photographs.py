@@ -11,13 +11,7 @@ import pycolmap
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from toolkit.capture.images import (
-    HEADER_ERRORS,
-    exif_camera,
-    exif_key,
-    find_mask,
-    read_header,
-)
+from toolkit.capture.images import HEADER_ERRORS, exif_camera, exif_key, find_mask, read_header
 from toolkit.errors import CaptureError, ImageError
 from toolkit.exchange.drafts import (
     CONVERTED_SUFFIXES,

@@ -30,11 +30,7 @@ from toolkit.capture import parse_camera
 from toolkit.capture.images import is_file, read_header
 from toolkit.capture.tables import FARTHEST_M
 from toolkit.errors import CaptureError, ImageError
-from toolkit.exchange.drafts import (
-    IMAGE_SUFFIXES,
-    every_nth,
-    start,
-)
+from toolkit.exchange.drafts import IMAGE_SUFFIXES, every_nth, start
 from toolkit.exchange.import_report import ImportReport
 from toolkit.geometry import Floats
 
