@@ -48,8 +48,6 @@ export_app = typer.Typer(help="Write files for other tools.", no_args_is_help=Tr
 app.add_typer(import_app, name="import")
 app.add_typer(export_app, name="export")
 
-MOST_LETTERS = 100
-"""Length of the name of a comparison's files, at most."""
 USAGE, INTERRUPTED = 2, 130
 """Exit codes of typer: a wrong option; Ctrl-C."""
 
@@ -755,7 +753,7 @@ def _compare(runs: list[Path], tell: Callable[..., None], as_json: bool, out: Pa
     comparison = compare_runs(list(map(str, runs)), seed)
     if not as_json:
         tell(comparison.text())
-    name = f"compare_{'_'.join(comparison.names)}"[:MOST_LETTERS]
+    name = f"compare_{'_'.join(comparison.names)}"[:100]  # file systems limit the length
     page = (out or runs[0].resolve().parent / f"{name}.html").resolve()
     first, *others = (str(run.resolve()) for run in runs)
     parameters = {"run": first, "others": others, "pictures": pictures, "seed": seed}

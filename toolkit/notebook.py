@@ -66,8 +66,6 @@ log = logging.getLogger(__name__)
 NOTEBOOKS = shipped("notebooks")
 Say = Callable[..., None]
 """Function that prints the progress lines of a run; called like `print`."""
-DEMO_RUN = "runs/demo"
-"""Folder of the demo's run in the repository, the default of notebooks."""
 COUNTS_MIME = "application/vnd.visual-localization.counts+json"
 # The stages whose results each stage reads, besides the capture. If one of them runs again, so does the stage.
 UPSTREAM: dict[str, tuple[str, ...]] = {
@@ -172,7 +170,7 @@ def find_run(run: str | Path) -> Path:
 
 def is_demo(run: Path) -> bool:
     """Tell whether a folder is that of the demo's run, whether it has run or not."""
-    return run == (project_root() / DEMO_RUN).resolve()
+    return run == (project_root() / "runs" / "demo").resolve()
 
 
 def _require_outside_of_runs(name: str, folder: Path) -> None:
@@ -429,16 +427,14 @@ def check_parameters(path: Path, parameters: Iterable[str]) -> None:
             raise ManifestError(f"{name}: {path.name} has no such parameter. {nearest(name, known)}")
 
 
-_TAKEN = ".taken.json"
-
-
 def _take_from_run(stage: str, files: SceneFiles, run: Path | None) -> None:
     """Fill the folder of notebooks by hand, as far as no notebook has made results there, with hard links.
 
     They lead to results of a finished run. If that run changes, its new results are taken. Caches are taken once, as
     stages find in them what still fits.
     """
-    taken, made_here = read_json(files.root / _TAKEN), files.of_stage(stage)
+    record, made_here = files.root / ".taken.json", files.of_stage(stage)
+    taken = read_json(record)
     if made_here is not None:
         taken.pop(made_here.name, None)  # the links stay until the stage replaces them; from now on they are its own
     results = {folder for stage in TAKEN if (folder := files.of_stage(stage))}
@@ -452,8 +448,8 @@ def _take_from_run(stage: str, files: SceneFiles, run: Path | None) -> None:
             link_folder(source, target)
             taken |= {name: state} if target in results else {}
             print(f"{name}: taken from {run}")
-    if taken or (files.root / _TAKEN).exists():
-        write_text(files.root / _TAKEN, json.dumps(taken) + "\n")
+    if taken or record.exists():
+        write_text(record, json.dumps(taken) + "\n")
 
 
 def _finished_run(runs: Path, scene: str) -> Path | None:
@@ -503,9 +499,6 @@ def _user_names() -> dict[str, Any]:
 
 def check_given(name: str) -> None:
     """Refuse wrong parameter values in the running notebook, and unknown parameters that papermill has injected.
-
-    Args:
-        name: name of the notebook, `<number>_<name>.ipynb`.
 
     Raises:
         ManifestError: names the parameter, what was found and what was expected.
@@ -606,11 +599,8 @@ def check_names(settings: Settings) -> None:
 
 
 def check_values(name: str, values: Mapping[str, Any]) -> None:
-    """Refuse parameters of a wrong type or value.
-
-    Args:
-        name: name of the notebook, `<number>_<name>.ipynb`. Parameters of a stage's notebook include its settings.
-        values: values by name; names that are no parameters of the notebook are ignored.
+    """Refuse parameters of the notebook `<number>_<name>.ipynb`, which include a stage's settings, of a wrong type or
+    value; names that are no parameters of it are ignored.
 
     Raises:
         ManifestError: names the first wrong parameter, what was found, what was expected, and what it means.
@@ -671,10 +661,6 @@ def _literals(source: str) -> dict[str, Any]:
     return values
 
 
-SHARE_EVERY_S = 30.0
-"""Seconds between lines about the progress of a stage where there is no terminal."""
-
-
 class StatusLine:
     """The progress of a running stage: on a terminal, the progress bar of the kernel; in a log, a line now and then."""
 
@@ -691,7 +677,7 @@ class StatusLine:
         if self.live and lines:
             width = shutil.get_terminal_size().columns - 1
             self.say(f"\r{f'{self.head} ... {lines[-1].strip()}'[:width]}\033[K", end="", flush=True)
-        elif lines and "%|" in lines[-1] and time.monotonic() - self.said > SHARE_EVERY_S:
+        elif lines and "%|" in lines[-1] and time.monotonic() - self.said > 30:  # seconds
             share = re.sub(r"\|[^|]*\|", "", lines[-1].strip())  # without the bar itself
             self.say(f"\n  {share}", end="", flush=True)
             log.info("%s  %s", self.head, share)
@@ -707,12 +693,9 @@ class StatusLine:
 
 
 def execute(
-    path: Path,
-    output: Path,
-    parameters: dict[str, Any],
-    progress: StatusLine | None = None,
+    path: Path, output: Path, parameters: dict[str, Any], progress: StatusLine | None = None,
     kernels: Kernels | None = None,
-) -> tuple[Any, float]:
+) -> tuple[Any, float]:  # fmt: skip
     """Execute the notebook `path` in a fresh kernel and write the executed copy to `output`.
 
     Args:
@@ -741,13 +724,9 @@ def execute(
         notebook = papermill.execute_notebook(
             # papermill formats paths with the parameters, so braces in them need escaping.
             *(str(file).replace("{", "{{").replace("}", "}}") for file in (path, partial)),
-            parameters=parameters,
-            kernel_name="python3",
-            progress_bar=False,
-            stderr_file=progress,
-            km=kernel.manager,
+            parameters=parameters, kernel_name="python3", progress_bar=False, stderr_file=progress, km=kernel.manager,
             coalesce_streams=True,
-        )
+        )  # fmt: skip
     except PapermillExecutionError as error:
         raise _cell_error(error, output) from None
     except RuntimeError as error:  # also nbclient's `DeadKernelError`

@@ -16,6 +16,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeAlias
 
@@ -181,7 +182,6 @@ class Draft(Options):
     times_from: str = ""
     before: int = 0  # images in the session that these are added to
     old_times: frozenset[int] = frozenset()  # and their timestamps
-    prepared: Prepared | None = None
     sensors: dict[str, str] = field(default_factory=dict)  # id by `camera_text`, for images that are not in a rig
     started: float = field(default_factory=time.perf_counter)
 
@@ -224,8 +224,8 @@ class Draft(Options):
         for draft in drafts:
             draft.follow()
             draft.leave_out()
-            draft.prepared = draft._prepare()  # all errors come before a session is written
-        if self.depth is not None and not any(draft.prepared and draft.prepared[-1] for draft in drafts):
+        depths = [draft.prepared[-1] for draft in drafts]  # all errors come before a session is written
+        if self.depth is not None and not any(depths):
             expected = f"that of {self.images[0].name} under the same name, or with `depth` for `color`"
             raise CaptureError(f"{self.depth}: no depth map of an image. Expected {expected}.")
         if self.listed_in:
@@ -284,8 +284,7 @@ class Draft(Options):
 
         If they do not tell it, the poses stay, and their unit is unknown.
         """
-        posed = [image for image in self.images if image.frame in self.poses and is_file(self.source(image.name))]
-        poses = self._camera_poses(posed)
+        poses = self._camera_poses([image for image in self.images if is_file(self.source(image.name))])
         turns = dict[str, int]()
         for name in poses:
             with suppress(ImageError):
@@ -458,7 +457,8 @@ class Draft(Options):
         self.notes += notes
         return "; ".join(notes)
 
-    def _prepare(self) -> Prepared:
+    @cached_property
+    def prepared(self) -> Prepared:
         times = self._choose_times()
         return times, self._find_masks(), self._odometry(times), self._fix_rows(times), self._find_depths(times)
 
@@ -466,7 +466,7 @@ class Draft(Options):
         """Write the session; call `leave_out` before."""
         if turned := sum(image.turned for image in self.images):
             self.notes.append(f"{turned} images have an EXIF orientation, which is ignored: pixels are used as stored")
-        times, masks, odometry, fixes, depths = self.prepared or self._prepare()
+        times, masks, odometry, fixes, depths = self.prepared
         columns = ["image", "status", "path", "timestamp", "sensor_id", "device_id", "camera"]
         left_out = [(str(row["image"]), str(row["status"])) for row in self.rows]
         left_out += [(name, reason) for reason, names in self.others.items() for name in names]
@@ -505,14 +505,16 @@ class Draft(Options):
                 else:
                     target.symlink_to(os.path.abspath(source))  # noqa: PTH100 - must not resolve links in the source
             made = session / "new" if self.before else session
-            self._write_tables(made, times, odometry, fixes, depths.values())
-            listed = table
+            self._write_tables(made)
+            listed, list_file = table, session / "proc" / "import.csv"
             if self.before:
                 _append(made, session)
-                listed = pd.concat([_read_rows(session), table]).drop_duplicates("image", keep="last")
+                if list_file.exists():
+                    listed = pd.concat([pd.read_csv(list_file, dtype=str, keep_default_na=False), table])
+                    listed = listed.drop_duplicates("image", keep="last")
                 old = read_json(session / IMPORT_RECORD)
                 record = old | record | {"before": self.before, "up": old.get("up", record["up"])}
-            with write_atomic(session / "proc" / "import.csv") as temporary:
+            with write_atomic(list_file) as temporary:
                 listed.to_csv(temporary, index=False)
             if self.placing == "link" or (self.before and is_linked_here(self.session)):
                 note_linked_here(session)
@@ -575,11 +577,9 @@ class Draft(Options):
         folder, _, name = sensor.rpartition("/")
         return sensor if self.depth_camera is None else f"{folder}/{name.replace('cam', 'depth')}"
 
-    def _write_tables(
-        self, session: Path, times: Mapping[str, int], odometry: Trajectory | None = None,
-        fixes: Sequence[tuple[Any, ...]] = (), depths: Collection[tuple[int, str, str]] = (),
-    ) -> None:  # fmt: skip
-        """Write the text files of the capture format; `times` are the timestamps of the frames, microseconds."""
+    def _write_tables(self, session: Path) -> None:
+        """Write the text files of the capture format."""
+        times, _, odometry, fixes, depths = self.prepared
         frame_of = {(times[image.frame], image.device): image.frame for image in self.images}
         keys = pd.DataFrame(sorted(frame_of), columns=["timestamp", "device_id"])
         trajectory = None
@@ -598,16 +598,14 @@ class Draft(Options):
             write_table(session / "gps.txt", ", ".join(name for name, _ in COLUMNS["gps.txt"]),
                         (", ".join(map(str, row)) for row in fixes))  # fmt: skip
         write_session(
-            session,
-            sensors,
-            [row for row in self.rigs if row[0] in rigs and row[1] in cameras] or None,
+            session, sensors, [row for row in self.rigs if row[0] in rigs and row[1] in cameras] or None,
             trajectory if is_map else odometry,
             sorted((times[image.frame], image.sensor, image.path) for image in self.images),
-            depths=sorted(depths) or None,
+            depths=sorted(depths.values()) or None,
             subsessions=[SUBSESSION],
             keyframes=None if is_map else {"pruned_subsampled": keys},  # the list localized by default
             ground_truth=None if is_map else trajectory,
-        )
+        )  # fmt: skip
 
     def _problem(self, image: DraftImage) -> str:
         """Return why an image cannot be used, or an empty text. Set its time and orientation from its EXIF header."""
@@ -639,8 +637,7 @@ class Draft(Options):
         if abs(width * camera.height - height * camera.width) <= max(sides) / 2:  # equal ratio up to rounding
             factor = width / camera.width
             is_crop = 0.9 < factor < 1.1  # nobody resizes by so little; undistortion and stabilization crop
-            problem += "; it seems to be cropped" if is_crop else ""
-            problem += "; use images of the camera's size"
+            problem += f"{'; it seems to be cropped' if is_crop else ''}; use images of the camera's size"
             problem += "" if is_crop else f", or multiply its intrinsics by {factor:.6g}"
         if 4 < orientation <= 8 and size == (camera.height, camera.width):
             problem += "; the camera fits the rotated image: rotate the pixels and remove the EXIF orientation"
@@ -720,11 +717,6 @@ def _append(made: Path, session: Path) -> None:
     shutil.rmtree(made)
 
 
-def _read_rows(session: Path) -> pd.DataFrame:
-    path = session / "proc" / "import.csv"
-    return pd.read_csv(path, dtype=str, keep_default_na=False) if path.exists() else pd.DataFrame({"image": []})
-
-
 def every_nth(frames: Sequence[str], number: int) -> set[str]:
     """Return every `number`-th of the frames, which becomes a query; none if it is 0.
 
@@ -739,10 +731,8 @@ def every_nth(frames: Sequence[str], number: int) -> set[str]:
 def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES, draft: Draft | None = None) -> list[str]:
     """Return the images in and below a folder, sorted by path. Links to folders elsewhere are followed, each once.
 
-    Sessions that an import has made are skipped, masks (see `images.find_mask`), and names that are not Unicode.
-
-    Args:
-        draft: gets the files that are left out, by the reason.
+    Sessions that an import has made are skipped, masks (see `images.find_mask`), and names that are not Unicode. The
+    draft gets the files that are left out, by the reason.
 
     Raises:
         CaptureError: there is no image.
@@ -754,9 +744,8 @@ def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES, draft:
     others = {"its name is not UTF-8: rename it": broken} if broken else {}
     for name in files:
         if (suffix := name[name.rfind(".") :].lower()) in PHOTOGRAPHS and suffix not in suffixes:
-            others.setdefault(f"{suffix} is not read: {HEIC_HOW if suffix in HEIC_SUFFIXES else CONVERT}", []).append(
-                name
-            )
+            how = HEIC_HOW if suffix in HEIC_SUFFIXES else CONVERT
+            others.setdefault(f"{suffix} is not read: {how}", []).append(name)
     note = [f"captures in the folder of images are skipped: {', '.join(captures[:3])}"] if captures else []
     if draft is not None:
         draft.others |= others

@@ -82,19 +82,14 @@ def import_colmap(
     draft.notes += content.notes
     draft.convention, draft.listed_in = "cam_from_world of the model", "the model"
     draft.frames_are_names = False
-    rig_of_image = {
-        image_id: (frame_id, frame)
-        for frame_id, frame in content.frames.items()
-        for image_id in frame.image_ids
-        if frame.rig_id in content.rigs
-    }
+    of_rigs = ((frame_id, frame) for frame_id, frame in content.frames.items() if frame.rig_id in content.rigs)
+    rig_of_image = {image_id: (frame_id, frame) for frame_id, frame in of_rigs for image_id in frame.image_ids}
     sensors = _sensors_of_rigs(content.rigs)
-    for rig_id, cameras in sorted(content.rigs.items()):
-        calibrated = {camera_id: pose for camera_id, pose in sorted(cameras.items()) if pose is not None}
-        draft.rigs += [
-            (f"{SUBSESSION}/rig_{rig_id}", sensors[rig_id, camera_id], inverse(sensor_from_rig))
-            for camera_id, sensor_from_rig in calibrated.items()
-        ]
+    draft.rigs = [
+        (f"{SUBSESSION}/rig_{rig_id}", sensors[rig_id, camera_id], inverse(sensor_from_rig))
+        for rig_id, cameras in sorted(content.rigs.items())
+        for camera_id, sensor_from_rig in sorted(cameras.items()) if sensor_from_rig is not None
+    ]  # fmt: skip
     moved, names = 0, set[str]()
     for image_id, image in sorted(content.images.items()):
         frame_id, frame = rig_of_image.get(image_id, (f"image {image_id}", None))  # a frame may have the same number
@@ -105,9 +100,8 @@ def import_colmap(
             sensor_from_rig = content.rigs[frame.rig_id].get(image.camera_id)
             pose = "its camera has no pose in its rig" if sensor_from_rig is None else frame.rig_from_world
             if not (sensor_from_rig is None or isinstance(pose, str) or isinstance(image.cam_from_world, str)):
-                moved += not np.allclose(
-                    (sensor_from_rig * pose).matrix(), image.cam_from_world.matrix(), rtol=1e-4, atol=1e-4
-                )
+                by_rig, own = (sensor_from_rig * pose).matrix(), image.cam_from_world.matrix()
+                moved += not np.allclose(by_rig, own, rtol=1e-4, atol=1e-4)
         if image.name in names:
             draft.rows.append({"image": image.name, "status": "its name occurs twice in the model"})
         elif isinstance(camera, str) or isinstance(pose, str):
@@ -282,8 +276,7 @@ def _sensors_of_rigs(rigs: Mapping[int, Mapping[int, pycolmap.Rigid3d | None]]) 
 def _listed(draft: Draft, folder: Path, only: Sequence[str], skip: Sequence[str]) -> list[str]:
     """Return the images of a folder that fit the patterns, and note what is left out or looks like no photograph."""
     names = list_images(folder, (*READ_SUFFIXES, *(HEIC_SUFFIXES if heic_is_read() else ())), draft)
-    chosen = [name for name in names if not only or any(_fits(name, pattern) for pattern in only)]
-    chosen = [name for name in chosen if not any(_fits(name, pattern) for pattern in skip)]
+    chosen = [name for name in names if (not only or _fits(name, only)) and not _fits(name, skip)]
     if not chosen:
         raise CaptureError(f"{folder}: none of {len(names)} images fits the patterns {', '.join([*only, *skip])}.")
     if len(chosen) < len(names):
@@ -297,8 +290,8 @@ def _listed(draft: Draft, folder: Path, only: Sequence[str], skip: Sequence[str]
     return chosen
 
 
-def _fits(name: str, pattern: str) -> bool:
-    return fnmatch(name, pattern) or fnmatch(Path(name).name, pattern)
+def _fits(name: str, patterns: Sequence[str]) -> bool:
+    return any(fnmatch(one, pattern) for pattern in patterns for one in (name, Path(name).name))
 
 
 def _is_no_photograph(path: Path) -> bool:

@@ -56,7 +56,8 @@ def import_panoramas(
     if twice := [name for name, count in stems.items() if count > 1]:
         raise CaptureError(f"{folder}: two panoramas have the name {twice[0]}. Rename one.")
     sizes: dict[int, int] = {}
-    with tempfile.TemporaryDirectory(dir=_existing_parent(Path(capture))) as temporary:
+    parent = next(one for one in (Path(capture).absolute(), *Path(capture).absolute().parents) if one.is_dir())
+    with tempfile.TemporaryDirectory(dir=parent) as temporary:
         out = Path(temporary)
 
         def cut(name: str) -> int | str:
@@ -88,10 +89,6 @@ def import_panoramas(
                            for yaw, rotation in _rig_from_views()]  # fmt: skip
         draft.convention = poses_are
         return draft.finish()
-
-
-def _existing_parent(path: Path) -> Path:
-    return next(one for one in (path.absolute(), *path.absolute().parents) if one.is_dir())
 
 
 def _rig_from_views() -> Iterator[tuple[int, Floats]]:

@@ -104,13 +104,9 @@ def numbers_in(rows: pd.DataFrame, columns: Sequence[str], path: Path) -> Floats
 
 def numbers_of(where: str, words: Sequence[str], count: int) -> Floats:
     """Return the first `count` words as numbers. Raise CaptureError, which names `where`, if they are none."""
-    try:
-        values = np.array([float(word) for word in words[:count]])
-        if len(values) == count:
-            return values
-    except ValueError:
-        pass
-    raise CaptureError(f"{where}: found {' '.join(words)[:80]!r}, expected {count} numbers.")
+    if len(words) < count or not all(map(is_number, words[:count])):
+        raise CaptureError(f"{where}: found {' '.join(words)[:80]!r}, expected {count} numbers.")
+    return np.array([float(word) for word in words[:count]])
 
 
 def to_us(times: Iterable[str | float], unit: str | None, where: object, near_us: Iterable[int] = ()) -> Ints:
@@ -268,22 +264,16 @@ def read_fixes(path: Path) -> pd.DataFrame:
 
 
 def find_depths(folder: Path, files: Sequence[str], times_us: Mapping[str, int]) -> dict[str, Path]:
-    """Return the depth maps of images, by the name of the image.
+    """Return the depth maps of images with `times_us`, by the name of the image; `files` are their paths in the folder.
 
     A depth map has the image's path, but for what follows the first dot and `depth` instead of `color` or `rgb`; or the
     time that is nearest, within `MAX_OFFSET_S`, where its name is a time in seconds (TUM).
-
-    Args:
-        folder: of the depth maps.
-        files: their paths in it.
-        times_us: of each image, microseconds.
     """
     by_key = {_key(file): file for file in files}
     found = {name: folder / by_key[_key(name)] for name in times_us if _key(name) in by_key}
-    stems = {file: _stem(file) for file in files}
-    if not found and all(map(is_number, stems.values())):
-        order = sorted(files, key=lambda file: float(stems[file]))
-        times = np.array([float(stems[file]) * 1e6 for file in order])
+    if not found and all(is_number(_stem(file)) for file in files):
+        order = sorted(files, key=lambda file: float(_stem(file)))
+        times = np.array([float(_stem(file)) * 1e6 for file in order])
         track = Track(times.astype(np.int64), np.zeros((len(order), 4, 4)), "")
         nearest = {name: track.nearest(time) for name, time in times_us.items()}
         found = {name: folder / order[row] for name, row in nearest.items() if row is not None}
