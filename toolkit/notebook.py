@@ -182,11 +182,7 @@ def _require_outside_of_runs(name: str, folder: Path) -> None:
 
 
 def sessions_of(run: str | None, sessions_root: str | None) -> tuple[Path, Path | None]:
-    """Return the folder `sessions` of a notebook's capture, and the finished run that it is of, if any.
-
-    Args:
-        run: run folder, see `find_run`. If it is absent, and the demo's, the demo capture is rendered.
-        sessions_root: the folder, instead of that of the run.
+    """Return the folder `sessions` of a notebook's capture, and the finished run that it is of, if any; see `start`.
 
     Raises:
         ArtifactError: there is no such run.
@@ -340,11 +336,9 @@ _BALANCES = {"images": ("embedded", "unreadable"), "queries": _STATUSES, "frames
 
 
 def finish(table: "pd.DataFrame | None" = None, **counts: Any) -> None:
-    """Display a notebook's counts and hand them to the pipeline, with the peak memory of this process.
+    """Display a notebook's counts, e.g. `images=120`, and hand them to the pipeline, with this process's peak memory.
 
-    Args:
-        table: the stage's table; rows with a `reason` count as left out.
-        **counts: what the stage did, e.g. `images=120`.
+    Rows of the stage's table with a `reason` count as left out.
 
     Raises:
         AssertionError: counts that belong together do not balance, see `_BALANCES`.
@@ -700,7 +694,6 @@ def execute(
 
     Args:
         output: path of the executed copy, which is also written if a cell fails.
-        parameters: values that replace those of the parameters cell.
         progress: shows what the kernel writes to stderr.
         kernels: source of the kernel; None: start one for this notebook.
 

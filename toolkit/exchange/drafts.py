@@ -207,8 +207,7 @@ class Draft(Options):
     def finish(self, held: Collection[str] | None = None) -> ImportReport:
         """Write the session without the images that cannot be used, and the queries that are held out of it.
 
-        Args:
-            held: the frames, or images without rigs, that become queries; None: every `hold_out`-th.
+        These are the frames `held`, or images without rigs; None: every `hold_out`-th.
 
         Raises:
             CaptureError: a session has no image left, or exists; none is written.

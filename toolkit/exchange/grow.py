@@ -6,7 +6,7 @@ given; its name is the first part of the names of its images.
 
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 
@@ -37,10 +37,7 @@ from toolkit.store.items import heals
 def add_recording(
     sources: Sequence[str | Path], capture: str | Path, device: str = "ios", fps: float | None = None
 ) -> ImportReport:
-    """Register photographs into the model of a capture and add them to its map session.
-
-    Args:
-        sources, capture, device, fps: as for `reconstruct`; the map session was made by it.
+    """Register photographs into the model of a capture and add them to its map session, both made by `reconstruct`.
 
     Raises:
         CaptureError: the session was not reconstructed, all photographs are in it already, or none fits into its model.
@@ -95,8 +92,10 @@ def remove_recording(name: str, capture: str | Path, device: str = "ios") -> str
     keys = {(str(row["timestamp"]), row["sensor_id"]) for row, one in
             zip(opened.images.to_dict("records"), opened.image_names, strict=True) if one in gone}  # fmt: skip
     with write_folder(session, replace=True, keep=True) as changed:
-        for file in ("images.txt", "trajectories.txt"):
-            _rewrite(changed / file, lambda cells: (cells[0], cells[1]) not in keys)
+        for path in (changed / "images.txt", changed / "trajectories.txt"):
+            rows = ((line, line.split(",")) for line in path.read_text(encoding="utf-8").splitlines())
+            kept = [line for line, cells in rows if line.startswith("#") or (*map(str.strip, cells[:2]),) not in keys]
+            write_table(path, None, kept)
         for one in gone:
             (changed / RAW_DATA / one.partition(f"/{RAW_DATA}/")[2]).unlink(missing_ok=True)
         table = pd.read_csv(changed / "proc" / "import.csv", dtype=str, keep_default_na=False)
@@ -194,13 +193,6 @@ def _register(work: _Work, base: pycolmap.Reconstruction, fixed: set[int]) -> py
         moved = model.image(number).cam_from_world()
         assert np.allclose(moved.matrix(), pose.matrix(), atol=1e-6), "the mapper has moved an image of the model"
     return model
-
-
-def _rewrite(path: Path, keep: Callable[[list[str]], bool]) -> None:
-    """Write the lines of a table again that a function of their cells keeps."""
-    lines = path.read_text(encoding="utf-8").splitlines()
-    kept = [line for line in lines if line.startswith("#") or keep([cell.strip() for cell in line.split(",")])]
-    write_table(path, None, kept)
 
 
 def _finish(folder: Path, session: Path, model: pycolmap.Reconstruction) -> None:

@@ -155,10 +155,7 @@ def _matches_to_hloc(matches: PairMatches, count: int) -> dict[str, NDArray[Any]
 
 
 def import_matches(path: str | Path, pairs: Iterable[tuple[str, str]], out: str | Path) -> MatchStore:
-    """Copy matches of pairs of images from a file of hloc to a folder, and return its content.
-
-    Args:
-        pairs: names of the two images, in either order; the file does not tell them.
+    """Copy matches of pairs of images, by name in either order, from a file of hloc to a folder; return its content.
 
     Raises:
         ArtifactError: the file is missing, torn or of another layout, or lacks a pair.

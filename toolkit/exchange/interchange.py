@@ -235,8 +235,7 @@ def import_once(
 def once(session: Path, inputs: Mapping[str, Any], make: Callable[[dict[str, Any]], ImportReport]) -> str:
     """Make a session, unless it was made before from the same inputs. Return a message for the user.
 
-    Args:
-        make: takes what `proc/import.json` is to have, see `drafts.Options`.
+    `make` takes what `proc/import.json` is to have, see `drafts.Options`.
 
     Raises:
         CaptureError: the session was made from other inputs; names them.

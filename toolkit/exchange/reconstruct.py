@@ -433,11 +433,7 @@ def add_posed(draft: Draft, item: Photograph, image: pycolmap.Image, sensor: str
 def reconstruct_once(
     photographs: str | Path, capture: str | Path, device: str = "ios", hold_out: int = 0, camera: str | None = None
 ) -> str:
-    """Reconstruct, unless it was done before from the same photographs. Return a message for the user.
-
-    Args:
-        photographs: an image file, a folder of images, or a video.
-        capture, device, hold_out, camera: see `reconstruct`.
+    """Reconstruct an image file, a folder of images or a video, unless it was done before. Return a message to show.
 
     Raises:
         CaptureError: the session was made from other input (the message names it); or as for `reconstruct`.

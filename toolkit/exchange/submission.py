@@ -150,8 +150,7 @@ def open_captures(
 ) -> Iterator[Callable[[str], Capture]]:
     """Yield a function that opens a scene's capture, with the kinds of devices and the links of the runs' manifests.
 
-    Args:
-        given: folders of captures that have moved since the runs; each must have the name of one of the `scenes`.
+    Captures that have moved since the runs are in the `given` folders, which have the names of scenes.
 
     Raises:
         ManifestError: a given folder has another name.

@@ -247,10 +247,7 @@ def _add_hard(sessions: Path, world: World, table: Tables, elsewhere: Scene) -> 
     """Add a recording of hard images to the phone's query session.
 
     The phone walks through the first room again, there and back: its images are those of the easy queries, changed as
-    `HARD` says, with their true poses. The last one is taken in another room, a few seconds later.
-
-    Args:
-        elsewhere: a painted room that is in no map.
+    `HARD` says, with their true poses. The last one is taken a few seconds later, in a painted room that is in no map.
     """
     import pycolmap
 
@@ -309,8 +306,7 @@ def _poses_between(table: Tables, world: World, name: str) -> list[tuple[int, st
 def _write_session(path: Path, world: World, table: Tables, rooms: list[Scene]) -> None:
     """Write the text files of a session, rows ordered by time. Query sessions get odometry instead of true poses.
 
-    Args:
-        rooms: all rooms, in which radio signals are scanned; empty: no scans.
+    Radio signals are scanned in all `rooms`, if any.
     """
     import pandas as pd
 
