@@ -51,6 +51,7 @@ app.add_typer(export_app, name="export")
 USAGE, INTERRUPTED = 2, 130
 """Exit codes of typer: a wrong option; Ctrl-C."""
 
+_CAM = "'MODEL, W, H, ...'"
 Device = Annotated[str, Option(help="Device type: ios, hl, spot or another name.")]
 Placing = Annotated[str, Option("--images", metavar="link|copy", help="Link to the images, or copy them.")]
 _MASKS = "Folder of masks, black where to use no features: 1.jpg.png of 1.jpg. Default: `masks` beside or in IMAGES."
@@ -168,9 +169,7 @@ def localize(
     photographs: Annotated[list[Path], Argument(help="Image files.")],
     device: Annotated[str | None, Option(help="Map device; default: the first of the run.")] = None,
     scene: Annotated[str | None, Option(help="Capture; default: the run's only one.")] = None,
-    camera: Annotated[
-        str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics; default: estimated from the matches.")
-    ] = None,
+    camera: Annotated[str | None, Option(metavar=_CAM, help="Intrinsics; default: estimated from the matches.")] = None,
     picture: Annotated[Path | None, Option(help="Image file to write: the map and the poses, from above.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -413,7 +412,7 @@ def _shared(
     odometry: Annotated[Path | None, Option(help="The queries' own poses: TUM, EuRoC, KITTI, ARKit.")] = None,
     depth: Annotated[Path | None, Option(metavar="DIR", help="Depth maps: PNG, 16 bits, millimeters.")] = None,
     depth_unit_mm: Annotated[float, Option("--depth-unit", metavar="MM", help="Millimeters per unit; TUM: 0.2.")] = 1.0,
-    depth_camera: Annotated[str | None, Option(metavar="'MODEL, W, H, ...'", help="If it is not the image's.")] = None,
+    depth_camera: Annotated[str | None, Option(metavar=_CAM, help="If it is not the image's.")] = None,
     fixes: Annotated[str | None, Option(metavar="exif|FILE", help=_FIXES)] = None,
     replace: Replace = False,
     add: Annotated[bool, Option("--add", help="Add the images that the session lacks; the others stay.")] = False,
@@ -426,11 +425,8 @@ def _shared(
 def import_colmap(
     model: Annotated[Path, Argument(help="Folder with cameras, images, points3D as .bin or .txt.")],
     images: Annotated[Path, Argument(help="Folder that the model's image names are relative to.")],
-    capture: ImportedTo,
-    split: Split = "map",
-    axes: Axes = "opencv",
-    unit_m: Unit = None,
-) -> None:
+    capture: ImportedTo, split: Split = "map", axes: Axes = "opencv", unit_m: Unit = None,
+) -> None:  # fmt: skip
     """Make a session from a COLMAP model: cameras, poses, rigs."""
 
 
@@ -447,7 +443,7 @@ def import_images(
     unit_m: MeterUnit = 1.0,
     truth: Annotated[Path | None, Option(help="CSV like the table, with ground-truth poses of queries.")] = None,
     camera: Annotated[
-        str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all images; else guessed from EXIF.")
+        str | None, Option(metavar=_CAM, help="Intrinsics of all images; else guessed from EXIF.")
     ] = None,
     cameras: Annotated[Path | None, Option(help="COLMAP's cameras.txt.")] = None,
     only: Annotated[list[str] | None, Option(metavar="PATTERN", help="Only such images: '*.color.png'.")] = None,
@@ -539,9 +535,7 @@ def reconstruct(
     device: Device = "ios",
     hold_out: Annotated[int, Option(metavar="N", help=_HELD_OUT)] = 0,
     fps: Annotated[float | None, Option(help="Frames per second of a video; default: chosen by motion.")] = None,
-    camera: Annotated[
-        str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all photographs; else estimated.")
-    ] = None,
+    camera: Annotated[str | None, Option(metavar=_CAM, help="Intrinsics of all photographs; else estimated.")] = None,
     distance: Annotated[
         tuple[str, str, float] | None, Option(metavar="IMAGE:X,Y IMAGE:X,Y METERS", help=_DISTANCE)
     ] = None,
@@ -656,25 +650,19 @@ def export_intrinsics(
 
 @exporter("features", "images", "hloc")
 def export_features(
-    run: Run,
-    scene: Scene,
-    session: Annotated[str, Argument(help="Session, e.g. ios_map.")],
-    out: Hdf5File,
+    run: Run, scene: Scene, session: Annotated[str, Argument(help="Session, e.g. ios_map.")], out: Hdf5File,
     kind: Kind = "sift",
-) -> None:
+) -> None:  # fmt: skip
     """Write the local features of a session in hloc's format."""
 
 
 @exporter("matches", "pairs", "hloc")
 def export_matches(
-    run: Run,
-    scene: Scene,
+    run: Run, scene: Scene,
     session0: Annotated[str, Argument(help="Session of the first images, e.g. ios_map.")],
     session1: Annotated[str, Argument(help="Session of the second images; the same for the pairs of a map.")],
-    out: Hdf5File,
-    kind: Kind = "sift",
-    capture: Capture = None,
-) -> None:
+    out: Hdf5File, kind: Kind = "sift", capture: Capture = None,
+) -> None:  # fmt: skip
     """Write the matches of two sessions in hloc's format."""
 
 

@@ -299,9 +299,8 @@ class Draft(Options):
             self.notes += placed.notes or ["no photograph has GPS" if known is None else "no image has a position"]
             return
         rotation, scale = new_from_old.rotation.matrix(), new_from_old.scale
-        self.poses = {
-            frame: make_pose(rotation @ pose[:3, :3], new_from_old * pose[:3, 3]) for frame, pose in self.poses.items()
-        }
+        self.poses = {name: make_pose(rotation @ one[:3, :3], new_from_old * one[:3, 3]) for name, one in
+                      self.poses.items()}  # fmt: skip
         self.rigs = [(rig, sensor, make_pose(pose[:3, :3], scale * pose[:3, 3])) for rig, sensor, pose in self.rigs]
         self.record |= placed.record
         self.notes += placed.notes
@@ -317,11 +316,9 @@ class Draft(Options):
     def _camera_poses(self, images: Sequence[DraftImage]) -> dict[str, Floats]:
         """Return world_from_cam (4, 4) of images that have one, by name."""
         of_sensor = {(rig, sensor): rig_from_sensor for rig, sensor, rig_from_sensor in self.rigs}
-        return {
-            image.name: self.poses[image.frame] @ of_sensor[image.rig, image.sensor] if image.rig
-            else self.poses[image.frame]
-            for image in images if image.frame in self.poses
-        }  # fmt: skip
+        posed = {image.name: (image, self.poses[image.frame]) for image in images if image.frame in self.poses}
+        return {name: pose @ of_sensor[image.rig, image.sensor] if image.rig else pose
+                for name, (image, pose) in posed.items()}  # fmt: skip
 
     def _split(self, held: Collection[str]) -> "Draft":
         """Move some frames to the draft of a query session."""
@@ -387,13 +384,11 @@ class Draft(Options):
         if folder is not None and not masks:
             first = self.images[0].name
             raise CaptureError(f"{folder}: no mask of {self.folder}. Expected that of {first} as {first}.png.")
-        for image in self.images:
-            size = stored_size(masks[image.name]) if image.name in masks else (image.camera.width, image.camera.height)
-            if size != (image.camera.width, image.camera.height):
-                self.notes.append(
-                    f"{masks[image.name]}: {size[0]} x {size[1]} pixels, expected {image.camera.width} x "
-                    f"{image.camera.height}, as {image.name}, which has no features until you correct its mask"
-                )
+        for image in (image for image in self.images if image.name in masks):
+            size, expected = stored_size(masks[image.name]), (image.camera.width, image.camera.height)
+            if size != expected:
+                pixels = f"{size[0]} x {size[1]} pixels, expected {expected[0]} x {expected[1]}, as {image.name}"
+                self.notes.append(f"{masks[image.name]}: {pixels}, which has no features until you correct its mask")
         return masks
 
     def leave_out(self) -> None:
@@ -566,11 +561,10 @@ class Draft(Options):
         files = [name for name in walk_files(folder)[0] if name.lower().endswith(".png")]
         files = [name for name in files if (folder / name).resolve() not in images]
         found = find_depths(folder, files, {image.name: times[image.frame] for image in self.images})
-        measured = ((found[image.name], image) for image in self.images if image.name in found)
         return {
-            file: (times[image.frame], self._depth_sensor(image.sensor), f"{SUBSESSION}/depth/{image.name}.png")
-            for file, image in measured
-        }
+            found[one.name]: (times[one.frame], self._depth_sensor(one.sensor), f"{SUBSESSION}/depth/{one.name}.png")
+            for one in self.images if one.name in found
+        }  # fmt: skip
 
     def _depth_sensor(self, sensor: str) -> str:
         folder, _, name = sensor.rpartition("/")
