@@ -661,7 +661,8 @@ class Draft(Options):
 
 
 def start(capture: str | Path, device: str, split: str, folder: Path, **options: Any) -> Draft:
-    """Return the draft of a new session. Raise CaptureError if it exists, ManifestError for an invalid argument."""
+    """Return the draft of a new session. Raise CaptureError if it exists; ManifestError for an unknown split, placing
+    or axes, a length that is not positive, an invalid `hold_out` or device, or options that exclude each other."""
     may_exist = options.get("replace", False) or options.get("add", False)
     draft = Draft(_session(Path(capture), device, split, may_exist), folder, **options)
     if draft.add and (draft.replace or draft.gps):

@@ -74,8 +74,7 @@ def import_colmap(
 
     Raises:
         CaptureError: no model in the folder, or a damaged one; the session exists already, or no image is left.
-        ManifestError: an unknown split, placing or axes, a unit that is not a positive length, an invalid `hold_out`,
-            or a device that cannot be part of a name.
+        ManifestError: as for `drafts.start`.
     """
     draft = start(capture, device, split, Path(images), **options)
     content = read_model(Path(model))
@@ -144,8 +143,7 @@ def import_images(
     Raises:
         CaptureError: a malformed table or camera (names file and line), an image without intrinsics, a map without
             poses, truth that names no image, the session exists already, or no image is left.
-        ManifestError: an unknown split, placing, direction or axes, a unit that is not a positive length, truth for a
-            map or together with poses in the table, or a device that cannot be part of a name.
+        ManifestError: an unknown direction, truth for a map or together with poses in the table; as for `drafts.start`.
     """
     if poses_are not in POSE_DIRECTIONS:
         raise ManifestError(f"poses_are: unknown {poses_are!r}. {nearest(poses_are, POSE_DIRECTIONS)}")
