@@ -141,8 +141,7 @@ def _furnish(scene: Scene, rng: Rng, wall: int, along: float, room: float, kind:
     tall = scene.size[2]
     width = {
         "shelf": rng.uniform(0.9, 1.6), "cabinet": rng.uniform(0.8, 1.4), "posters": rng.uniform(0.6, 0.9),
-        "door": 1.0, "window": rng.uniform(1.1, 1.5), "board": rng.uniform(1.2, 1.8), "crates": 1.1,
-        "pillar": 0.4,
+        "door": 1.0, "window": rng.uniform(1.1, 1.5), "board": rng.uniform(1.2, 1.8), "crates": 1.1, "pillar": 0.4,
         "painting": rng.uniform(0.9, 1.5), "planter": rng.uniform(0.9, 1.5), "bench": rng.uniform(1.3, 1.8),
     }[kind]  # fmt: skip
     if width > room:
@@ -296,16 +295,13 @@ def _furnish_middle(scene: Scene, rng: Rng) -> None:
     w, d, h = scene.size
     for sx, sy in product((1, -1), repeat=2):
         x, y, yaw = sx * (w / 2 - 0.42), sy * (d / 2 - 0.42), rng.uniform(0, 6)
-        kind = rng.integers(3)
-        if kind == 0:
-            scene.box((x, y, yaw), 0, (0.42, 0.42, 0.9), tex.poster)
-            scene.box((x, y, yaw + 0.5), 0.9, (0.3, 0.3, 0.35), tex.books)
-        elif kind == 1:
-            scene.box((x, y, yaw), 0, (0.4, 0.4, 0.4), tex.crate)
-            scene.box((x, y, yaw + 0.3), 0.4, (0.36, 0.36, 0.8), tex.leaves)
-        else:
-            scene.box((x, y, yaw), 0, (0.5, 0.45, 0.5), tex.crate)
-            scene.box((x, y, yaw + 0.4), 0.5, (0.4, 0.35, 0.4), tex.drawers)
+        below, above, turn = (
+            (((0.42, 0.42, 0.9), tex.poster), ((0.3, 0.3, 0.35), tex.books), 0.5),
+            (((0.4, 0.4, 0.4), tex.crate), ((0.36, 0.36, 0.8), tex.leaves), 0.3),
+            (((0.5, 0.45, 0.5), tex.crate), ((0.4, 0.35, 0.4), tex.drawers), 0.4),
+        )[rng.integers(3)]
+        scene.box((x, y, yaw), 0, *below)
+        scene.box((x, y, yaw + turn), below[0][2], *above)
     yaw, tone = rng.uniform(-0.4, 0.4), partial(tex.wood, color=np.asarray(OAK[0]) * rng.uniform(0.6, 1.2))
     c, s = np.cos(yaw), np.sin(yaw)
     if not scene.outdoor and rng.random() < 0.7:  # a table
