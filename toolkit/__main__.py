@@ -403,8 +403,7 @@ def _shared(
     device: Device = "ios",
     hold_out: Annotated[int, Option(metavar="N", help="Every Nth image becomes a query with truth; 0: none.")] = 0,
     match_names: Annotated[bool, Option("--match-names", help=_ALIKE)] = False,
-    placing: Placing = "link",
-    masks: Masks = None,
+    placing: Placing = "link", masks: Masks = None,
     gps: Annotated[bool, Option("--gps", help=_GPS)] = False,
     positions: Positions = None,
     timestamps: Annotated[str | None, Option(metavar="names|FILE", help=_TIMES)] = None,
@@ -417,7 +416,7 @@ def _shared(
     replace: Replace = False,
     add: Annotated[bool, Option("--add", help="Add the images that the session lacks; the others stay.")] = False,
     as_json: ReportJson = False,
-) -> None:
+) -> None:  # fmt: skip
     """Hold the options of all imports, see `exchange.drafts.Options`."""
 
 
@@ -433,14 +432,12 @@ def import_colmap(
 @importer("images", "interchange")
 def import_images(
     images: Annotated[Path, Argument(help="Folder of JPEG and PNG files.")],
-    capture: ImportedTo,
-    split: Split = "query",
+    capture: ImportedTo, split: Split = "query",
     table: Annotated[Path | None, Option(help=_TABLE)] = None,
     poses_are: Annotated[
         str, Option(metavar="world_from_cam|cam_from_world|rotation_of_cam_from_world", help=_DIRECTION)
     ] = "world_from_cam",
-    axes: Axes = "opencv",
-    unit_m: MeterUnit = 1.0,
+    axes: Axes = "opencv", unit_m: MeterUnit = 1.0,
     truth: Annotated[Path | None, Option(help="CSV like the table, with ground-truth poses of queries.")] = None,
     camera: Annotated[
         str | None, Option(metavar=_CAM, help="Intrinsics of all images; else guessed from EXIF.")
@@ -448,22 +445,20 @@ def import_images(
     cameras: Annotated[Path | None, Option(help="COLMAP's cameras.txt.")] = None,
     only: Annotated[list[str] | None, Option(metavar="PATTERN", help="Only such images: '*.color.png'.")] = None,
     skip: Annotated[list[str] | None, Option(metavar="PATTERN", help="No such images: 'masks/*'.")] = None,
-) -> None:
+) -> None:  # fmt: skip
     """Make a session from a folder of images: a map with poses, or queries."""
 
 
 @importer("panoramas", "panoramas")
 def import_panoramas(
     images: Annotated[Path, Argument(help="Folder of equirectangular JPEG and PNG files, of the whole sphere.")],
-    capture: ImportedTo,
-    split: Split = "query",
+    capture: ImportedTo, split: Split = "query",
     table: Annotated[Path | None, Option(help="CSV: image,qw,qx,qy,qz,tx,ty,tz of each panorama.")] = None,
     poses_are: Annotated[
         str, Option(metavar="world_from_cam|cam_from_world", help="Direction of the table's poses.")
     ] = "world_from_cam",
-    axes: Axes = "opencv",
-    unit_m: MeterUnit = 1.0,
-) -> None:
+    axes: Axes = "opencv", unit_m: MeterUnit = 1.0,
+) -> None:  # fmt: skip
     """Make a session of 360-degree panoramas: each becomes a rig of perspective views."""
 
 
@@ -472,12 +467,9 @@ def import_transforms(
     path: Annotated[
         Path, Argument(metavar="transforms", help="transforms.json of nerfstudio or instant-ngp, near its images.")
     ],
-    capture: ImportedTo,
-    split: Split = "map",
-    axes: Axes = "opengl",
-    unit_m: Unit = None,
+    capture: ImportedTo, split: Split = "map", axes: Axes = "opengl", unit_m: Unit = None,
     undo_applied: Annotated[bool, Option("--undo-applied", help=_APPLIED)] = False,
-) -> None:
+) -> None:  # fmt: skip
     """Make a session from a transforms.json: cameras with distortion, poses."""
 
 
@@ -541,12 +533,10 @@ def reconstruct(
     ] = None,
     positions: Positions = None,
     mapper: Annotated[str, Option(metavar="incremental|global", help="COLMAP's mapper.")] = "incremental",
-    placing: Placing = "link",
-    masks: Masks = None,
+    placing: Placing = "link", masks: Masks = None,
     remove: Annotated[str | None, Option(metavar="RECORDING", help=_REMOVE)] = None,
-    replace: Replace = False,
-    as_json: ReportJson = False,
-) -> None:
+    replace: Replace = False, as_json: ReportJson = False,
+) -> None:  # fmt: skip
     """Make a map from photographs or videos without poses, by structure from motion; or add them to the map of CAPTURE.
 
     Poses that are in the map stay as they are.
@@ -602,9 +592,8 @@ def export_colmap(
     scene: Scene,
     device: Annotated[str, Argument(help="Map device, e.g. ios.")],
     out: Annotated[Path, Argument(help="New folder for the model.")],
-    capture: Capture = None,
-    names: Names = "own",
-) -> None:
+    capture: Capture = None, names: Names = "own",
+) -> None:  # fmt: skip
     """Write the triangulated map of a run as a COLMAP model."""
     from toolkit.exchange import export
 
