@@ -204,16 +204,13 @@ def sessions_of(run: str | None, sessions_root: str | None) -> tuple[Path, Path 
 
 
 def own_folder(folder: str | None, scene: str, images: str | None = None) -> Path:
-    """Return the folder for a capture made of the user's own images, and for its results.
-
-    Args:
-        folder: that folder; None: the default.
-        scene: without `images`, the default is `data/<scene>` of the repository.
-        images: folder of images; the default is `<images>-localized` beside it.
+    """Return the folder for a capture made of the user's own images, and for its results: as given; or by default
+    `<images>-localized` beside the folder `images`, or without images `data/<scene>` of the repository.
     """
     if folder is not None:
-        _require_outside_of_runs("out_dir", Path(folder).expanduser().resolve())
-        return Path(folder).expanduser().resolve()
+        given = Path(folder).expanduser().resolve()
+        _require_outside_of_runs("out_dir", given)
+        return given
     if images is None:
         return project_root() / "data" / scene
     beside = Path(images).expanduser().resolve()
@@ -478,8 +475,7 @@ def _run_stage(stage: str, sessions: Path, files: SceneFiles, run: Path | None) 
         "retrieve": [files.embeddings, files.retrieval_dir],
         "localize": [files.retrieval_dir, files.poses_dir, files.features, files.maps],
     }
-    name = "embed_sessions" if stage == "embed" else f"{stage}_pairs"
-    options = {} if stage == "embed" else {"queries": manifest.queries}
+    name, options = ("embed_sessions", {}) if stage == "embed" else (f"{stage}_pairs", {"queries": manifest.queries})
     run_stage = getattr(import_module(f"toolkit.{stage}"), name)
     run_stage(sessions, *folders[stage], manifest.stage(stage), **options)
 

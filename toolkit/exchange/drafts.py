@@ -347,14 +347,11 @@ class Draft(Options):
             units = f"{unit or 'unknown'}, that of the new ones {found or 'unknown'}"
             raise CaptureError(f"{self.session}: the unit of its poses is {units}.")
         self.record = {key: before[key] for key in before if key == "meters"} | self.record | {"unit": unit}
-        images, self.images = self.images, []
-        for image in images:
-            if known.isdisjoint((image.name, f"{image.name}.png")):
-                self.images.append(image)
-            else:
-                self.others.setdefault("in the session already", []).append(image.name)
-        if images and not self.images:
-            raise CaptureError(f"{self.session}: has all {len(images)} images already, so there is none to add.")
+        there = [image.name for image in self.images if {image.name, f"{image.name}.png"} & known]
+        if there and len(there) == len(self.images):
+            raise CaptureError(f"{self.session}: has all {len(there)} images already, so there is none to add.")
+        self.images = [image for image in self.images if {image.name, f"{image.name}.png"}.isdisjoint(known)]
+        self.others |= {"in the session already": there} if there else {}
         if not is_linked_here(self.session):  # links of others do not become the user's own
             self.placing = "copy"
         self.before, self.old_times = len(known), frozenset(old.images["timestamp"].tolist())
@@ -401,8 +398,7 @@ class Draft(Options):
             if share[image.sensor] < MIN_INVERTIBLE and not problems[image.name]:
                 percent = f"{100 * (1 - share[image.sensor]):.0f} %"
                 problems[image.name] = f"the distortion of its camera cannot be inverted in {percent} of the image"
-        partly = [sensor for sensor, part in share.items() if MIN_INVERTIBLE <= part < 1]
-        if partly:
+        if partly := [sensor for sensor, part in share.items() if MIN_INVERTIBLE <= part < 1]:
             of = f"{', '.join(partly[:5])}{' and others' if len(partly) > 5 else ''} ({len(partly)} of {len(share)})"
             self.notes.append(f"distortion that cannot be inverted near the edge of the image: {of}")
         self.rows += [{"image": name, "status": problem} for name, problem in problems.items() if problem]

@@ -93,8 +93,7 @@ def read_csv(path: Path) -> pd.DataFrame:
 
 
 def numbers_in(rows: pd.DataFrame, columns: Sequence[str], path: Path) -> Floats:
-    """Return columns of a table, see `read_csv`, as numbers. Raise CaptureError if one is missing or has another value.
-    """
+    """Return columns of a table, see `read_csv`, as numbers. Raise CaptureError if one is missing or no number."""
     table = rows.reindex(columns=columns).apply(pd.to_numeric, errors="coerce").to_numpy(float)
     for row in np.flatnonzero(~np.isfinite(table).all(axis=1)).tolist():
         found = ", ".join(map(str, rows.iloc[row, :-1]))
@@ -179,9 +178,7 @@ def lines_of_images(names: Sequence[str], count: int) -> list[int] | None:
     return lines if len(set(lines)) == len(names) and max(lines) < count else None
 
 
-def read_track(
-    path: Path, unit: str | None, times: Path | None = None, near_us: Iterable[int] = ()
-) -> Track | None:  # fmt: skip
+def read_track(path: Path, unit: str | None, times: Path | None = None, near_us: Iterable[int] = ()) -> Track | None:
     """Read a list of poses without names of images; None if the file is something else.
 
     A line has 8 numbers: time, position, qx qy qz qw (TUM), or of nanoseconds and commas: qw qx qy qz, which may be

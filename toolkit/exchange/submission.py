@@ -136,10 +136,8 @@ def collect(
     pairs = pd.DataFrame(rows, columns=["file", *COUNTS, "state"])
     text = _description(description)
     if filled := pairs["filled"].sum():
-        text += (
-            f"{filled} of {pairs['asked'].sum()} queries were not localized and have the pose of their nearest "
-            "reference image.\n"
-        )
+        how = "were not localized and have the pose of their nearest reference image"
+        text += f"{filled} of {pairs['asked'].sum()} queries {how}.\n"
     path = Path(out) if out else folders[0] / "submission.zip"
     return Submission(path, text, poses, pd.concat(tables)[COLUMNS_OF_QUERIES], pairs)
 
