@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import partial, wraps
+from importlib import import_module
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
@@ -38,9 +39,7 @@ except ModuleNotFoundError as missing:  # users may run `python -m toolkit` with
     ) from None
 
 app = typer.Typer(
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    no_args_is_help=True, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
 )
 
 
@@ -49,11 +48,10 @@ export_app = typer.Typer(help="Write files for other tools.", no_args_is_help=Tr
 app.add_typer(import_app, name="import")
 app.add_typer(export_app, name="export")
 
-MOST_LETTERS = 100
-"""Length of the name of a comparison's files, at most."""
 USAGE, INTERRUPTED = 2, 130
 """Exit codes of typer: a wrong option; Ctrl-C."""
 
+_CAM = "'MODEL, W, H, ...'"
 Device = Annotated[str, Option(help="Device type: ios, hl, spot or another name.")]
 Placing = Annotated[str, Option("--images", metavar="link|copy", help="Link to the images, or copy them.")]
 _MASKS = "Folder of masks, black where to use no features: 1.jpg.png of 1.jpg. Default: `masks` beside or in IMAGES."
@@ -63,10 +61,11 @@ Scene = Annotated[str, Argument(help="Name of the capture.")]
 MapDevice = Annotated[str, Argument(help="Map device.")]
 QueryDevice = Annotated[str, Argument(help="Query device.")]
 TextFile = Annotated[Path, Argument(help="Text file.")]
+Hdf5File = Annotated[Path, Argument(help="HDF5 file.")]
+Kind = Annotated[str, Option(help="Kind of features.")]
 _AXES = "Camera axes of the poses. opencv: x right, y down, z forward; opengl: x right, y up, z backward."
 Axes = Annotated[str, Option("--axes", metavar="opencv|opengl", help=_AXES)]
 _DIRECTION = "Direction of the table's poses; the last has camera centers, as NVM, Bundler and Cambridge have them."
-HoldOut = Annotated[int, Option(metavar="N", help="Every Nth image becomes a query with truth; 0: none.")]
 ImportedTo = Annotated[Path, Argument(help="Capture folder; the session is sessions/<device>_<split>.")]
 _SPLIT = "A map needs poses; those of queries become ground truth."
 Split = Annotated[str, Option(metavar="map|query", help=_SPLIT)]
@@ -74,10 +73,8 @@ Unit = Annotated[float | None, Option("--unit", metavar="METERS", help="Meters p
 MeterUnit = Annotated[float, Option("--unit", metavar="METERS", help="Meters per unit of the poses, e.g. 0.01.")]
 Replace = Annotated[bool, Option("--replace", help="Replace the session if it exists.")]
 ReportJson = Annotated[bool, Option("--json", help="Print the report as JSON, as in proc/import.json.")]
-MatchNames = Annotated[
-    bool, Option("--match-names", help="Take files whose names differ only in case, extension or separators.")
-]
-Gps = Annotated[bool, Option("--gps", help="Move the world to x east, y north, z up, in meters, by GPS in EXIF.")]
+_ALIKE = "Take files whose names differ only in case, extension or separators."
+_GPS = "Move the world to x east, y north, z up, in meters, by GPS in EXIF."
 Positions = Annotated[Path | None, Option(help="CSV: image,x,y,z, known camera centers in meters.")]
 _TIMES = "Times of the images: the last numbers in their names, or a file with time and name in each line."
 _FIXES = "GPS: CSV with image or timestamp, latitude, longitude, altitude, accuracy; or exif."
@@ -147,9 +144,7 @@ def run(
         if sweeps and (name or in_place):
             raise ManifestError("--sweep names its runs itself: leave out --name and --in-place.")
         if sweeps:
-            _compare_swept(
-                *pipeline.sweep(path, sweeps, overrides or (), tell, only, force, cluster), tell, as_json
-            )
+            _compare_swept(*pipeline.sweep(path, sweeps, overrides or (), tell, only, force, cluster), tell, as_json)
             return
         run_dir = pipeline.run(path, only, force, overrides or (), tell, cluster, name, in_place)
     except BaseException as error:
@@ -174,9 +169,7 @@ def localize(
     photographs: Annotated[list[Path], Argument(help="Image files.")],
     device: Annotated[str | None, Option(help="Map device; default: the first of the run.")] = None,
     scene: Annotated[str | None, Option(help="Capture; default: the run's only one.")] = None,
-    camera: Annotated[
-        str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics; default: estimated from the matches.")
-    ] = None,
+    camera: Annotated[str | None, Option(metavar=_CAM, help="Intrinsics; default: estimated from the matches.")] = None,
     picture: Annotated[Path | None, Option(help="Image file to write: the map and the poses, from above.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -378,17 +371,20 @@ def demo_data(
     print(f"Capture: {capture}")
 
 
-def importer(name: str) -> Callable[[Callable[..., Any]], None]:
-    """Register an import, which returns its report, as a command that also takes the options of all imports."""
+def importer(name: str, module: str | None = None) -> Callable[[Callable[..., Any]], None]:
+    """Register an import, which returns its report, as a command that also takes the options of all imports.
+
+    With a module of `toolkit.exchange`, it is the function there that has the name of the command.
+    """
 
     def register(command: Callable[..., Any]) -> None:
         own, shared = inspect.signature(command, eval_str=True), inspect.signature(_shared, eval_str=True)
         parameters = {**own.parameters, **shared.parameters, **own.parameters}  # its own come first, and win
-        del parameters["options"]
+        parameters.pop("options", None)
 
         @wraps(command)
         def run_it(as_json: bool, **given: Any) -> None:
-            report = command(**given)
+            report = (_in_exchange(module, command) if module else command)(**given)
             if report is not None:
                 print(report.as_json() if as_json else report.text())
 
@@ -399,110 +395,82 @@ def importer(name: str) -> Callable[[Callable[..., Any]], None]:
     return register
 
 
+def _in_exchange(module: str, command: Callable[..., Any]) -> Callable[..., Any]:
+    return getattr(import_module(f"toolkit.exchange.{module}"), command.__name__)
+
+
 def _shared(
     device: Device = "ios",
-    hold_out: HoldOut = 0,
-    match_names: MatchNames = False,
-    placing: Placing = "link",
-    masks: Masks = None,
-    gps: Gps = False,
+    hold_out: Annotated[int, Option(metavar="N", help="Every Nth image becomes a query with truth; 0: none.")] = 0,
+    match_names: Annotated[bool, Option("--match-names", help=_ALIKE)] = False,
+    placing: Placing = "link", masks: Masks = None,
+    gps: Annotated[bool, Option("--gps", help=_GPS)] = False,
     positions: Positions = None,
     timestamps: Annotated[str | None, Option(metavar="names|FILE", help=_TIMES)] = None,
     timestamps_unit: Annotated[str | None, Option(metavar="s|ms|us|ns", help="Of times that are given.")] = None,
     odometry: Annotated[Path | None, Option(help="The queries' own poses: TUM, EuRoC, KITTI, ARKit.")] = None,
     depth: Annotated[Path | None, Option(metavar="DIR", help="Depth maps: PNG, 16 bits, millimeters.")] = None,
     depth_unit_mm: Annotated[float, Option("--depth-unit", metavar="MM", help="Millimeters per unit; TUM: 0.2.")] = 1.0,
-    depth_camera: Annotated[str | None, Option(metavar="'MODEL, W, H, ...'", help="If it is not the image's.")] = None,
+    depth_camera: Annotated[str | None, Option(metavar=_CAM, help="If it is not the image's.")] = None,
     fixes: Annotated[str | None, Option(metavar="exif|FILE", help=_FIXES)] = None,
     replace: Replace = False,
     add: Annotated[bool, Option("--add", help="Add the images that the session lacks; the others stay.")] = False,
     as_json: ReportJson = False,
-) -> None:
+) -> None:  # fmt: skip
     """Hold the options of all imports, see `exchange.drafts.Options`."""
 
 
-@importer("colmap")
+@importer("colmap", "interchange")
 def import_colmap(
     model: Annotated[Path, Argument(help="Folder with cameras, images, points3D as .bin or .txt.")],
     images: Annotated[Path, Argument(help="Folder that the model's image names are relative to.")],
-    capture: ImportedTo,
-    split: Split = "map",
-    axes: Axes = "opencv",
-    unit_m: Unit = None,
-    **options: Any,
-) -> Any:
+    capture: ImportedTo, split: Split = "map", axes: Axes = "opencv", unit_m: Unit = None,
+) -> None:  # fmt: skip
     """Make a session from a COLMAP model: cameras, poses, rigs."""
-    from toolkit.exchange import interchange
-
-    return interchange.import_colmap(model, images, capture, split=split, axes=axes, unit_m=unit_m, **options)
 
 
-@importer("images")
+@importer("images", "interchange")
 def import_images(
     images: Annotated[Path, Argument(help="Folder of JPEG and PNG files.")],
-    capture: ImportedTo,
-    split: Split = "query",
+    capture: ImportedTo, split: Split = "query",
     table: Annotated[Path | None, Option(help=_TABLE)] = None,
     poses_are: Annotated[
         str, Option(metavar="world_from_cam|cam_from_world|rotation_of_cam_from_world", help=_DIRECTION)
     ] = "world_from_cam",
-    axes: Axes = "opencv",
-    unit_m: MeterUnit = 1.0,
+    axes: Axes = "opencv", unit_m: MeterUnit = 1.0,
     truth: Annotated[Path | None, Option(help="CSV like the table, with ground-truth poses of queries.")] = None,
     camera: Annotated[
-        str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all images; else guessed from EXIF.")
+        str | None, Option(metavar=_CAM, help="Intrinsics of all images; else guessed from EXIF.")
     ] = None,
     cameras: Annotated[Path | None, Option(help="COLMAP's cameras.txt.")] = None,
     only: Annotated[list[str] | None, Option(metavar="PATTERN", help="Only such images: '*.color.png'.")] = None,
     skip: Annotated[list[str] | None, Option(metavar="PATTERN", help="No such images: 'masks/*'.")] = None,
-    **options: Any,
-) -> Any:
+) -> None:  # fmt: skip
     """Make a session from a folder of images: a map with poses, or queries."""
-    from toolkit.exchange import interchange
-
-    return interchange.import_images(
-        images, capture, split=split, table=table, poses_are=poses_are, camera=camera, cameras=cameras, truth=truth,
-        only=only, skip=skip, axes=axes, unit_m=unit_m, **options,
-    )  # fmt: skip
 
 
-@importer("panoramas")
+@importer("panoramas", "panoramas")
 def import_panoramas(
     images: Annotated[Path, Argument(help="Folder of equirectangular JPEG and PNG files, of the whole sphere.")],
-    capture: ImportedTo,
-    split: Split = "query",
+    capture: ImportedTo, split: Split = "query",
     table: Annotated[Path | None, Option(help="CSV: image,qw,qx,qy,qz,tx,ty,tz of each panorama.")] = None,
     poses_are: Annotated[
         str, Option(metavar="world_from_cam|cam_from_world", help="Direction of the table's poses.")
     ] = "world_from_cam",
-    axes: Axes = "opencv",
-    unit_m: MeterUnit = 1.0,
-    **options: Any,
-) -> Any:
+    axes: Axes = "opencv", unit_m: MeterUnit = 1.0,
+) -> None:  # fmt: skip
     """Make a session of 360-degree panoramas: each becomes a rig of perspective views."""
-    from toolkit.exchange import panoramas
-
-    return panoramas.import_panoramas(
-        images, capture, split=split, table=table, poses_are=poses_are, axes=axes, unit_m=unit_m, **options
-    )
 
 
-@importer("transforms")
+@importer("transforms", "transforms")
 def import_transforms(
-    transforms: Annotated[Path, Argument(help="transforms.json of nerfstudio or instant-ngp, near its images.")],
-    capture: ImportedTo,
-    split: Split = "map",
-    axes: Axes = "opengl",
-    unit_m: Unit = None,
+    path: Annotated[
+        Path, Argument(metavar="transforms", help="transforms.json of nerfstudio or instant-ngp, near its images.")
+    ],
+    capture: ImportedTo, split: Split = "map", axes: Axes = "opengl", unit_m: Unit = None,
     undo_applied: Annotated[bool, Option("--undo-applied", help=_APPLIED)] = False,
-    **options: Any,
-) -> Any:
+) -> None:  # fmt: skip
     """Make a session from a transforms.json: cameras with distortion, poses."""
-    from toolkit.exchange.transforms import import_transforms
-
-    return import_transforms(
-        transforms, capture, split=split, undo_applied=undo_applied, axes=axes, unit_m=unit_m, **options
-    )
 
 
 @importer("dataset")
@@ -559,20 +527,16 @@ def reconstruct(
     device: Device = "ios",
     hold_out: Annotated[int, Option(metavar="N", help=_HELD_OUT)] = 0,
     fps: Annotated[float | None, Option(help="Frames per second of a video; default: chosen by motion.")] = None,
-    camera: Annotated[
-        str | None, Option(metavar="'MODEL, W, H, ...'", help="Intrinsics of all photographs; else estimated.")
-    ] = None,
+    camera: Annotated[str | None, Option(metavar=_CAM, help="Intrinsics of all photographs; else estimated.")] = None,
     distance: Annotated[
         tuple[str, str, float] | None, Option(metavar="IMAGE:X,Y IMAGE:X,Y METERS", help=_DISTANCE)
     ] = None,
     positions: Positions = None,
     mapper: Annotated[str, Option(metavar="incremental|global", help="COLMAP's mapper.")] = "incremental",
-    placing: Placing = "link",
-    masks: Masks = None,
+    placing: Placing = "link", masks: Masks = None,
     remove: Annotated[str | None, Option(metavar="RECORDING", help=_REMOVE)] = None,
-    replace: Replace = False,
-    as_json: ReportJson = False,
-) -> None:
+    replace: Replace = False, as_json: ReportJson = False,
+) -> None:  # fmt: skip
     """Make a map from photographs or videos without poses, by structure from motion; or add them to the map of CAPTURE.
 
     Poses that are in the map stay as they are.
@@ -628,111 +592,84 @@ def export_colmap(
     scene: Scene,
     device: Annotated[str, Argument(help="Map device, e.g. ios.")],
     out: Annotated[Path, Argument(help="New folder for the model.")],
-    capture: Capture = None,
-    names: Names = "own",
-) -> None:
+    capture: Capture = None, names: Names = "own",
+) -> None:  # fmt: skip
     """Write the triangulated map of a run as a COLMAP model."""
     from toolkit.exchange import export
 
     print(f"{out}: {export.export_colmap(run, scene, device, out, capture, names).summary()}")
 
 
-@export_app.command("pairs")
+def exporter(name: str, unit: str, module: str = "export") -> Callable[[Callable[..., None]], None]:
+    """Register the function of `toolkit.exchange.<module>` with the name of a command, which returns a number."""
+
+    def register(command: Callable[..., None]) -> None:
+        @wraps(command)
+        def run_it(out: Path, **given: Any) -> None:
+            print(f"{out}: {_in_exchange(module, command)(out=out, **given)} {unit}")
+
+        export_app.command(name)(run_it)
+
+    return register
+
+
+@exporter("pairs", "pairs")
 def export_pairs(
-    run: Run,
-    scene: Scene,
-    map_device: MapDevice,
-    query_device: QueryDevice,
-    out: TextFile,
-    topk: Annotated[int | None, Option(min=1, help="References per query; default: all.")] = None,
-    names: Names = "own",
-) -> None:
+    run: Run, scene: Scene, map_device: MapDevice, query_device: QueryDevice, out: TextFile,
+    topk: Annotated[int | None, Option(min=1, help="References per query; default: all.")] = None, names: Names = "own",
+) -> None:  # fmt: skip
     """Write the retrieval of a pair in hloc's format: `query reference` per line."""
-    from toolkit.exchange import export
-
-    print(f"{out}: {export.export_pairs(run, scene, map_device, query_device, out, topk, names)} pairs")
 
 
-def _export_of_pair(what: str, unit: str) -> Callable[..., None]:
-    def export(
-        run: Run,
-        scene: Scene,
-        map_device: MapDevice,
-        query_device: QueryDevice,
-        out: TextFile,
-        capture: Capture = None,
-        names: Names = "own",
-    ) -> None:
-        from toolkit.exchange import export
-
-        function = getattr(export, f"export_{what}")
-        print(f"{out}: {function(run, scene, map_device, query_device, out, capture, names)} {unit}")
-
-    return export
+@exporter("poses", "poses")
+def export_poses(
+    run: Run, scene: Scene, map_device: MapDevice, query_device: QueryDevice, out: TextFile, capture: Capture = None,
+    names: Names = "own",
+) -> None:  # fmt: skip
+    """Write the poses of a pair's queries in hloc's format: `name qw qx qy qz tx ty tz` per line, cam_from_world."""
 
 
-for _what, _unit, _help in (
-    ("poses", "poses", "Write the poses of a pair's queries in hloc's format: `name qw qx qy qz tx ty tz` per line, "
-     "cam_from_world."),
-    ("intrinsics", "images", "Write the cameras of a pair's queries in hloc's format: `name MODEL width height "
-     "parameters` per line."),
-):  # fmt: skip
-    export_app.command(_what, help=_help)(_export_of_pair(_what, _unit))
+@exporter("intrinsics", "images")
+def export_intrinsics(
+    run: Run, scene: Scene, map_device: MapDevice, query_device: QueryDevice, out: TextFile, capture: Capture = None,
+    names: Names = "own",
+) -> None:  # fmt: skip
+    """Write the cameras of a pair's queries in hloc's format: `name MODEL width height parameters` per line."""
 
 
-@export_app.command("features")
+@exporter("features", "images", "hloc")
 def export_features(
-    run: Run,
-    scene: Scene,
-    session: Annotated[str, Argument(help="Session, e.g. ios_map.")],
-    out: Annotated[Path, Argument(help="HDF5 file.")],
-    kind: Annotated[str, Option(help="Kind of features.")] = "sift",
-) -> None:
+    run: Run, scene: Scene, session: Annotated[str, Argument(help="Session, e.g. ios_map.")], out: Hdf5File,
+    kind: Kind = "sift",
+) -> None:  # fmt: skip
     """Write the local features of a session in hloc's format."""
-    from toolkit.exchange import hloc
-
-    print(f"{out}: {hloc.export_features(run, scene, session, out, kind)} images")
 
 
-@export_app.command("matches")
+@exporter("matches", "pairs", "hloc")
 def export_matches(
-    run: Run,
-    scene: Scene,
+    run: Run, scene: Scene,
     session0: Annotated[str, Argument(help="Session of the first images, e.g. ios_map.")],
     session1: Annotated[str, Argument(help="Session of the second images; the same for the pairs of a map.")],
-    out: Annotated[Path, Argument(help="HDF5 file.")],
-    kind: Annotated[str, Option(help="Kind of features.")] = "sift",
-    capture: Capture = None,
-) -> None:
+    out: Hdf5File, kind: Kind = "sift", capture: Capture = None,
+) -> None:  # fmt: skip
     """Write the matches of two sessions in hloc's format."""
-    from toolkit.exchange import hloc
-
-    print(f"{out}: {hloc.export_matches(run, scene, session0, session1, out, kind, capture)} pairs")
 
 
-_OUT_GEO = "File to write: .csv, or .geojson."
-_OUT_EXIF = "Folder for copies of the pictures."
-
-
-@export_app.command("geo")
-def export_geo(run: Run, out: Annotated[Path, Argument(help=_OUT_GEO)], capture: Capture = None) -> None:
+@exporter("geo", "images", "geo")
+def export_geo(
+    run: Run, out: Annotated[Path, Argument(help="File to write: .csv, or .geojson.")], capture: Capture = None
+) -> None:
     """Write latitude, longitude, altitude and heading of the queries of a run in maps with GPS."""
-    from toolkit.exchange import geo
-
-    print(f"{out}: {geo.export_geo(run, out, capture)} images")
 
 
-@export_app.command("exif")
+@exporter("exif", "pictures", "geo")
 def export_exif(
     run: Run,
-    out: Annotated[Path, Argument(help=_OUT_EXIF)],
+    out: Annotated[Path, Argument(help="Folder for copies of the pictures.")],
     capture: Capture = None,
     unsure: Annotated[bool, Option("--unsure", help="Also poses of low confidence.")] = False,
 ) -> None:
     """Write position and direction into copies of the query pictures of a run in maps with GPS."""
-    from toolkit.exchange import geo
-
-    print(f"{out}: {geo.export_exif(run, out, capture, unsure)} pictures")
 
 
 @app.command()
@@ -793,7 +730,7 @@ def _compare(runs: list[Path], tell: Callable[..., None], as_json: bool, out: Pa
     comparison = compare_runs(list(map(str, runs)), seed)
     if not as_json:
         tell(comparison.text())
-    name = f"compare_{'_'.join(comparison.names)}"[:MOST_LETTERS]
+    name = f"compare_{'_'.join(comparison.names)}"[:100]  # file systems limit the length
     page = (out or runs[0].resolve().parent / f"{name}.html").resolve()
     first, *others = (str(run.resolve()) for run in runs)
     parameters = {"run": first, "others": others, "pictures": pictures, "seed": seed}

@@ -66,8 +66,6 @@ log = logging.getLogger(__name__)
 NOTEBOOKS = shipped("notebooks")
 Say = Callable[..., None]
 """Function that prints the progress lines of a run; called like `print`."""
-DEMO_RUN = "runs/demo"
-"""Folder of the demo's run in the repository, the default of notebooks."""
 COUNTS_MIME = "application/vnd.visual-localization.counts+json"
 # The stages whose results each stage reads, besides the capture. If one of them runs again, so does the stage.
 UPSTREAM: dict[str, tuple[str, ...]] = {
@@ -123,9 +121,7 @@ class Folders(SimpleNamespace):
         return "\n".join(f"{name:<{max(map(len, folders))}}  {path}" for name, path in folders.items())
 
 
-def start(
-    stage: str, sessions_root: str | None = None, run: str | None = None, **folders: str | None
-) -> Folders:
+def start(stage: str, sessions_root: str | None = None, run: str | None = None, **folders: str | None) -> Folders:
     """Resolve the folders of a notebook; check its parameters.
 
     Args:
@@ -174,7 +170,7 @@ def find_run(run: str | Path) -> Path:
 
 def is_demo(run: Path) -> bool:
     """Tell whether a folder is that of the demo's run, whether it has run or not."""
-    return run == (project_root() / DEMO_RUN).resolve()
+    return run == (project_root() / "runs" / "demo").resolve()
 
 
 def _require_outside_of_runs(name: str, folder: Path) -> None:
@@ -186,11 +182,7 @@ def _require_outside_of_runs(name: str, folder: Path) -> None:
 
 
 def sessions_of(run: str | None, sessions_root: str | None) -> tuple[Path, Path | None]:
-    """Return the folder `sessions` of a notebook's capture, and the finished run that it is of, if any.
-
-    Args:
-        run: run folder, see `find_run`. If it is absent, and the demo's, the demo capture is rendered.
-        sessions_root: the folder, instead of that of the run.
+    """Return the folder `sessions` of a notebook's capture, and the finished run that it is of, if any; see `start`.
 
     Raises:
         ArtifactError: there is no such run.
@@ -212,16 +204,13 @@ def sessions_of(run: str | None, sessions_root: str | None) -> tuple[Path, Path 
 
 
 def own_folder(folder: str | None, scene: str, images: str | None = None) -> Path:
-    """Return the folder for a capture made of the user's own images, and for its results.
-
-    Args:
-        folder: that folder; None: the default.
-        scene: without `images`, the default is `data/<scene>` of the repository.
-        images: folder of images; the default is `<images>-localized` beside it.
+    """Return the folder for a capture made of the user's own images, and for its results: as given; or by default
+    `<images>-localized` beside the folder `images`, or without images `data/<scene>` of the repository.
     """
     if folder is not None:
-        _require_outside_of_runs("out_dir", Path(folder).expanduser().resolve())
-        return Path(folder).expanduser().resolve()
+        given = Path(folder).expanduser().resolve()
+        _require_outside_of_runs("out_dir", given)
+        return given
     if images is None:
         return project_root() / "data" / scene
     beside = Path(images).expanduser().resolve()
@@ -344,11 +333,9 @@ _BALANCES = {"images": ("embedded", "unreadable"), "queries": _STATUSES, "frames
 
 
 def finish(table: "pd.DataFrame | None" = None, **counts: Any) -> None:
-    """Display a notebook's counts and hand them to the pipeline, with the peak memory of this process.
+    """Display a notebook's counts, e.g. `images=120`, and hand them to the pipeline, with this process's peak memory.
 
-    Args:
-        table: the stage's table; rows with a `reason` count as left out.
-        **counts: what the stage did, e.g. `images=120`.
+    Rows of the stage's table with a `reason` count as left out.
 
     Raises:
         AssertionError: counts that belong together do not balance, see `_BALANCES`.
@@ -431,16 +418,14 @@ def check_parameters(path: Path, parameters: Iterable[str]) -> None:
             raise ManifestError(f"{name}: {path.name} has no such parameter. {nearest(name, known)}")
 
 
-_TAKEN = ".taken.json"
-
-
 def _take_from_run(stage: str, files: SceneFiles, run: Path | None) -> None:
     """Fill the folder of notebooks by hand, as far as no notebook has made results there, with hard links.
 
     They lead to results of a finished run. If that run changes, its new results are taken. Caches are taken once, as
     stages find in them what still fits.
     """
-    taken, made_here = read_json(files.root / _TAKEN), files.of_stage(stage)
+    record, made_here = files.root / ".taken.json", files.of_stage(stage)
+    taken = read_json(record)
     if made_here is not None:
         taken.pop(made_here.name, None)  # the links stay until the stage replaces them; from now on they are its own
     results = {folder for stage in TAKEN if (folder := files.of_stage(stage))}
@@ -454,8 +439,8 @@ def _take_from_run(stage: str, files: SceneFiles, run: Path | None) -> None:
             link_folder(source, target)
             taken |= {name: state} if target in results else {}
             print(f"{name}: taken from {run}")
-    if taken or (files.root / _TAKEN).exists():
-        write_text(files.root / _TAKEN, json.dumps(taken) + "\n")
+    if taken or record.exists():
+        write_text(record, json.dumps(taken) + "\n")
 
 
 def _finished_run(runs: Path, scene: str) -> Path | None:
@@ -465,9 +450,7 @@ def _finished_run(runs: Path, scene: str) -> Path | None:
     return max(with_scene, key=lambda run: (run.name == scene, str(records[run].get("created"))), default=None)
 
 
-def _make_upstream(
-    stage: str, sessions: Path, files: SceneFiles, folders: set[Path | None], run: Path | None
-) -> None:
+def _make_upstream(stage: str, sessions: Path, files: SceneFiles, folders: set[Path | None], run: Path | None) -> None:
     """Run the earlier stages whose results `stage` needs and whose folder is in `folders` and empty or absent."""
     for name in UPSTREAM[stage]:
         folder = files.of_stage(name)
@@ -492,8 +475,7 @@ def _run_stage(stage: str, sessions: Path, files: SceneFiles, run: Path | None) 
         "retrieve": [files.embeddings, files.retrieval_dir],
         "localize": [files.retrieval_dir, files.poses_dir, files.features, files.maps],
     }
-    name = "embed_sessions" if stage == "embed" else f"{stage}_pairs"
-    options = {} if stage == "embed" else {"queries": manifest.queries}
+    name, options = ("embed_sessions", {}) if stage == "embed" else (f"{stage}_pairs", {"queries": manifest.queries})
     run_stage = getattr(import_module(f"toolkit.{stage}"), name)
     run_stage(sessions, *folders[stage], manifest.stage(stage), **options)
 
@@ -507,9 +489,6 @@ def _user_names() -> dict[str, Any]:
 
 def check_given(name: str) -> None:
     """Refuse wrong parameter values in the running notebook, and unknown parameters that papermill has injected.
-
-    Args:
-        name: name of the notebook, `<number>_<name>.ipynb`.
 
     Raises:
         ManifestError: names the parameter, what was found and what was expected.
@@ -610,11 +589,8 @@ def check_names(settings: Settings) -> None:
 
 
 def check_values(name: str, values: Mapping[str, Any]) -> None:
-    """Refuse parameters of a wrong type or value.
-
-    Args:
-        name: name of the notebook, `<number>_<name>.ipynb`. Parameters of a stage's notebook include its settings.
-        values: values by name; names that are no parameters of the notebook are ignored.
+    """Refuse parameters of the notebook `<number>_<name>.ipynb`, which include a stage's settings, of a wrong type or
+    value; names that are no parameters of it are ignored.
 
     Raises:
         ManifestError: names the first wrong parameter, what was found, what was expected, and what it means.
@@ -675,10 +651,6 @@ def _literals(source: str) -> dict[str, Any]:
     return values
 
 
-SHARE_EVERY_S = 30.0
-"""Seconds between lines about the progress of a stage where there is no terminal."""
-
-
 class StatusLine:
     """The progress of a running stage: on a terminal, the progress bar of the kernel; in a log, a line now and then."""
 
@@ -695,7 +667,7 @@ class StatusLine:
         if self.live and lines:
             width = shutil.get_terminal_size().columns - 1
             self.say(f"\r{f'{self.head} ... {lines[-1].strip()}'[:width]}\033[K", end="", flush=True)
-        elif lines and "%|" in lines[-1] and time.monotonic() - self.said > SHARE_EVERY_S:
+        elif lines and "%|" in lines[-1] and time.monotonic() - self.said > 30:  # seconds
             share = re.sub(r"\|[^|]*\|", "", lines[-1].strip())  # without the bar itself
             self.say(f"\n  {share}", end="", flush=True)
             log.info("%s  %s", self.head, share)
@@ -711,17 +683,13 @@ class StatusLine:
 
 
 def execute(
-    path: Path,
-    output: Path,
-    parameters: dict[str, Any],
-    progress: StatusLine | None = None,
+    path: Path, output: Path, parameters: dict[str, Any], progress: StatusLine | None = None,
     kernels: Kernels | None = None,
-) -> tuple[Any, float]:
+) -> tuple[Any, float]:  # fmt: skip
     """Execute the notebook `path` in a fresh kernel and write the executed copy to `output`.
 
     Args:
         output: path of the executed copy, which is also written if a cell fails.
-        parameters: values that replace those of the parameters cell.
         progress: shows what the kernel writes to stderr.
         kernels: source of the kernel; None: start one for this notebook.
 
@@ -741,18 +709,13 @@ def execute(
     import papermill
     from papermill.exceptions import PapermillExecutionError
 
-
     try:
         notebook = papermill.execute_notebook(
             # papermill formats paths with the parameters, so braces in them need escaping.
             *(str(file).replace("{", "{{").replace("}", "}}") for file in (path, partial)),
-            parameters=parameters,
-            kernel_name="python3",
-            progress_bar=False,
-            stderr_file=progress,
-            km=kernel.manager,
+            parameters=parameters, kernel_name="python3", progress_bar=False, stderr_file=progress, km=kernel.manager,
             coalesce_streams=True,
-        )
+        )  # fmt: skip
     except PapermillExecutionError as error:
         raise _cell_error(error, output) from None
     except RuntimeError as error:  # also nbclient's `DeadKernelError`

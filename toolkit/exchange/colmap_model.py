@@ -8,7 +8,7 @@ import codecs
 import mmap
 import re
 import struct
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,7 +26,6 @@ NORM_TOLERANCE = 0.01
 """Deviation from 1 of the length of a quaternion that counts as rounding."""
 _CAMERA = 0
 """Type of the sensors that are cameras, in .bin files."""
-_SUFFIXES = (".bin", ".txt")
 _LATER_CHANGED = int(pycolmap.CameraModelId.RAD_TAN_THIN_PRISM_FISHEYE)
 """Model that had 14 parameters in earlier versions of COLMAP."""
 
@@ -84,10 +83,11 @@ def read_model(folder: Path) -> ColmapModel:
     model, suffix = ColmapModel(), suffixes[0]
     if len(suffixes) > 1:
         model.notes.append("the model has .bin and .txt files: .bin is read. Move it elsewhere to read .txt")
-    for name in ("cameras", "images", "rigs", "frames"):
+    images = _binary_images if suffix == ".bin" else _text_images
+    for name, read in (("cameras", _cameras), ("images", images), ("rigs", _rigs), ("frames", _frames)):
         path = folder / f"{name}{suffix}"
         if path.is_file():
-            _READERS[suffix, name](path, model)
+            read(path, model)
     return model
 
 
@@ -99,7 +99,7 @@ def read_cameras(path: Path) -> dict[str, pycolmap.Camera | str]:
     """
     model = ColmapModel()
     try:
-        (_binary_cameras if path.suffix == ".bin" else _text_cameras)(path, model)
+        _cameras(path, model)
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error}). Expected COLMAP's cameras.txt.") from None
     if not model.cameras:
@@ -109,10 +109,8 @@ def read_cameras(path: Path) -> dict[str, pycolmap.Camera | str]:
 
 def _formats(folder: Path) -> list[str]:
     """Return the suffixes of the formats in which a folder has cameras and images."""
-    return [suffix for suffix in _SUFFIXES if all((folder / f"{name}{suffix}").is_file() for name in _NEEDED)]
-
-
-_NEEDED = ("cameras", "images")
+    names = ("cameras", "images")
+    return [suffix for suffix in (".bin", ".txt") if all((folder / f"{name}{suffix}").is_file() for name in names)]
 
 
 def _no_model(folder: Path, models: Sequence[Path]) -> CaptureError:
@@ -163,18 +161,11 @@ def _set_images(model: ColmapModel, rows: Mapping[int, tuple[str, int, Sequence[
         model.images[image_id] = ModelImage(name, camera_id, pose)
 
 
-def _camera(
-    model_name: str, size: Sequence[Any], params: Sequence[Any], where: str = ""
-) -> pycolmap.Camera | str:
+def _camera(model_name: str, size: Sequence[Any], params: Sequence[Any], where: str = "") -> pycolmap.Camera | str:
     try:
         return parse_camera("camera", ", ".join([model_name, *map(str, size), *map(str, params)]))
     except ValueError as error:
         return f"its camera cannot be used: {where}{error}"
-
-
-def _add_rig(model: ColmapModel, rig_id: int, cameras: dict[int, pycolmap.Rigid3d | None], sensors: int) -> None:
-    if sensors > 1:
-        model.rigs[rig_id] = cameras
 
 
 # Text
@@ -214,7 +205,10 @@ def _malformed(path: Path, number: int, line: str, expected: str) -> CaptureErro
     return CaptureError(f"{path}, line {number}: found {line[:80]!r}, expected {expected}. Export the model again.")
 
 
-def _text_cameras(path: Path, model: ColmapModel) -> None:
+def _cameras(path: Path, model: ColmapModel) -> None:
+    if path.suffix == ".bin":
+        _binary_cameras(path, model)
+        return
     for number, line in _lines(path):
         if words := line.split():
             if len(words) < 4 or not words[0].isdecimal():
@@ -277,43 +271,21 @@ def is_number(word: str) -> bool:
     return True
 
 
-def _text_rigs(path: Path, model: ColmapModel) -> None:
-    expected = "RIG_ID NUM_SENSORS REF_SENSOR_TYPE REF_SENSOR_ID, then TYPE ID HAS_POSE [QW QX QY QZ TX TY TZ]"
-    for number, line in _lines(path):
-        words = iter(line.split())
-        if not line:
-            continue
-        try:
-            rig_id, count, cameras = int(next(words)), int(next(words)), dict[int, pycolmap.Rigid3d | None]()
-            for sensor in range(count):
-                kind, sensor_id = next(words), int(next(words))
-                pose: pycolmap.Rigid3d | str | None = pycolmap.Rigid3d()
-                if sensor:
-                    pose = _pose([float(next(words)) for _ in range(7)]) if int(next(words)) else None
-                if kind == "CAMERA":
-                    cameras[sensor_id] = None if isinstance(pose, str) else pose
-        except (ValueError, StopIteration, RuntimeError):
-            raise _malformed(path, number, line, expected) from None
-        if next(words, None) is not None:
-            raise _malformed(path, number, line, expected)
-        _add_rig(model, _new(path, "rig", rig_id, model.rigs), cameras, count)
+class _Words:
+    """A line of rigs.txt or frames.txt, read as the record of a binary file."""
 
+    def __init__(self, path: Path, number: int, line: str, expected: str) -> None:
+        self.words, self.error = iter(line.split()), _malformed(path, number, line, expected)
 
-def _text_frames(path: Path, model: ColmapModel) -> None:
-    expected = "FRAME_ID RIG_ID QW QX QY QZ TX TY TZ NUM_DATA_IDS, then TYPE SENSOR_ID DATA_ID"
-    for number, line in _lines(path):
-        words = line.split()
-        if not line:
-            continue
+    def read(self, form: str) -> list[Any]:
+        """Return values by `struct`'s format; an `i` is the type of a sensor."""
+        codes = re.sub(r"(\d+)(.)", lambda found: int(found[1]) * found[2], form)
         try:
-            frame_id, rig_id, count = int(words[0]), int(words[1]), int(words[9])
-            pose, data = _pose([float(word) for word in words[2:9]]), words[10:]
-            if len(data) != 3 * count:
-                raise ValueError
-            images = [int(data[k + 2]) for k in range(0, len(data), 3) if data[k] == "CAMERA"]
-        except (ValueError, IndexError):
-            raise _malformed(path, number, line, expected) from None
-        model.frames[_new(path, "frame", frame_id, model.frames)] = ModelFrame(rig_id, pose, images)
+            words = [(code, next(self.words)) for code in codes]
+            return [float(word) if code == "d" else word != "CAMERA" if code == "i" else int(word)
+                    for code, word in words]  # fmt: skip
+        except (ValueError, StopIteration):
+            raise self.error from None
 
 
 # Binary
@@ -381,38 +353,44 @@ def _binary_images(path: Path, model: ColmapModel) -> None:
     _set_images(model, rows)
 
 
-def _binary_rigs(path: Path, model: ColmapModel) -> None:
-    file = _Binary(path)
-    for _ in file:
-        rig_id, count = file.read("II")
+# Rigs and frames, in both formats
+
+
+def _records(path: Path, expected: str) -> "Iterator[_Binary | _Words]":
+    """Yield the records of a file, to be read to their ends; `expected` is the content of a line of text."""
+    if path.suffix == ".bin":
+        file = _Binary(path)
+        for _ in file:
+            yield file
+    for number, line in _lines(path) if path.suffix == ".txt" else ():
+        if line:
+            words = _Words(path, number, line, expected)
+            yield words
+            if next(words.words, None) is not None:
+                raise words.error
+
+
+def _rigs(path: Path, model: ColmapModel) -> None:
+    expected = "RIG_ID NUM_SENSORS REF_SENSOR_TYPE REF_SENSOR_ID, then TYPE ID HAS_POSE [QW QX QY QZ TX TY TZ]"
+    for record in _records(path, expected):
+        rig_id, count = record.read("II")
         cameras = dict[int, pycolmap.Rigid3d | None]()
         for sensor in range(count):
-            kind, sensor_id = file.read("iI")
+            kind, sensor_id = record.read("iI")
             pose: pycolmap.Rigid3d | str | None = pycolmap.Rigid3d()
             if sensor:
-                pose = _pose(file.read("7d")) if file.read("B")[0] else None
+                pose = _pose(record.read("7d")) if record.read("B")[0] else None
             if kind == _CAMERA:
                 cameras[sensor_id] = None if isinstance(pose, str) else pose
-        _add_rig(model, _new(path, "rig", rig_id, model.rigs), cameras, count)
+        _new(path, "rig", rig_id, model.rigs)
+        if count > 1:
+            model.rigs[rig_id] = cameras
 
 
-def _binary_frames(path: Path, model: ColmapModel) -> None:
-    file = _Binary(path)
-    for _ in file:
-        frame_id, rig_id, *values, count = file.read("II7dI")
-        data = [file.read("iIQ") for _ in range(count)]
+def _frames(path: Path, model: ColmapModel) -> None:
+    expected = "FRAME_ID RIG_ID QW QX QY QZ TX TY TZ NUM_DATA_IDS, then TYPE SENSOR_ID DATA_ID"
+    for record in _records(path, expected):
+        frame_id, rig_id, *values, count = record.read("II7dI")
+        data = [record.read("iIQ") for _ in range(count)]
         images = [image_id for kind, _, image_id in data if kind == _CAMERA]
-        frame_id = _new(path, "frame", frame_id, model.frames)
-        model.frames[frame_id] = ModelFrame(rig_id, _pose(values), images)
-
-
-_READERS: dict[tuple[str, str], Callable[[Path, ColmapModel], None]] = {
-    (".txt", "cameras"): _text_cameras,
-    (".txt", "images"): _text_images,
-    (".txt", "rigs"): _text_rigs,
-    (".txt", "frames"): _text_frames,
-    (".bin", "cameras"): _binary_cameras,
-    (".bin", "images"): _binary_images,
-    (".bin", "rigs"): _binary_rigs,
-    (".bin", "frames"): _binary_frames,
-}
+        model.frames[_new(path, "frame", frame_id, model.frames)] = ModelFrame(rig_id, _pose(values), images)

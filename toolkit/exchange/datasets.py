@@ -29,7 +29,6 @@ from toolkit.manifest import nearest
 HOLD_OUT = 8
 """Every such photograph becomes a query, in data sets without a split."""
 _SEVEN_SCENES = (525.0, 525.0, 320.0, 240.0)  # of the color camera, as usual for this data set; none is published
-_DEPTH_585 = "PINHOLE, 640, 480, 585, 585, 320, 240"  # of 7-Scenes' depth camera, from the data set's page
 _TWELVE_SCENES = (572.0, 572.0, 320.0, 240.0)  # at 640 x 480, where a scene has no info.txt
 _TUM = {
     "freiburg1": "FULL_OPENCV, 640, 480, 517.3, 516.5, 318.6, 255.3, .2624, -.9531, -.0054, .0026, 1.1633, 0, 0, 0",
@@ -211,12 +210,8 @@ def _depth_of_twelve_scenes(folder: Path) -> dict[str, Any]:
     return {"depth": folder, "depth_camera": _twelve_scenes_camera(folder, "Depth", size)}
 
 
-def _depth_of_tum(folder: Path) -> dict[str, Any]:
-    return {"depth": folder / "depth", "depth_unit_mm": 0.2} if any(folder.glob("depth/*.png")) else {}
-
-
-def _depth_of_seven_scenes(folder: Path) -> dict[str, Any]:
-    return {"depth": folder, "depth_camera": _DEPTH_585} if any(folder.glob("seq-*/*.depth.png")) else {}
+def _depth_in(name: str, pattern: str, **options: Any) -> Callable[[Path], dict[str, Any]]:
+    return lambda folder: {"depth": folder / name, **options} if any(folder.glob(pattern)) else {}
 
 
 def _cambridge(folder: Path) -> tuple[Path, list[Photograph]]:
@@ -339,13 +334,15 @@ def _euroc(folder: Path) -> tuple[Path, list[Photograph]]:
     return cam0, images
 
 
+_DEPTH_585 = _depth_in("", "seq-*/*.depth.png", depth_camera="PINHOLE, 640, 480, 585, 585, 320, 240")  # from its page
+_DEPTH_TUM = _depth_in("depth", "depth/*.png", depth_unit_mm=0.2)
 LAYOUTS = {
-    "7scenes": Layout(_seven_scenes, [(5.0, 0.05)], "TrainSplit.txt", _depth_of_seven_scenes),
+    "7scenes": Layout(_seven_scenes, [(5.0, 0.05)], "TrainSplit.txt", _DEPTH_585),
     "12scenes": Layout(_twelve_scenes, [(5.0, 0.05)], "split.txt", _depth_of_twelve_scenes),
     "cambridge": Layout(_cambridge, [(5.0, 0.25), (5.0, 0.5)], "dataset_train.txt"),
     "aachen": Layout(_aachen, [(2.0, 0.25), (5.0, 0.5), (10.0, 5.0)], "3D-models"),
     "eth3d": Layout(_eth3d, [(1.0, 0.05), (5.0, 0.25)], "dslr_calibration_undistorted"),
-    "tum": Layout(_tum, [(1.0, 0.05), (5.0, 0.25)], "groundtruth.txt", _depth_of_tum),
+    "tum": Layout(_tum, [(1.0, 0.05), (5.0, 0.25)], "groundtruth.txt", _DEPTH_TUM),
     "kitti": Layout(_kitti, [(1.0, 0.25), (2.0, 0.5)], "calib.txt"),
     "euroc": Layout(_euroc, [(1.0, 0.1), (5.0, 0.5)], "mav0"),
 }

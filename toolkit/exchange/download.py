@@ -46,23 +46,12 @@ _WORKERS = 8  # threads for small files, which mostly wait for the network; arch
 
 
 def download(
-    manifest_path: str | Path,
-    sessions: Sequence[str] = (),
-    dry_run: bool = False,
-    overrides: Iterable[str] = (),
+    manifest_path: str | Path, sessions: Sequence[str] = (), dry_run: bool = False, overrides: Iterable[str] = ()
 ) -> "list[CheckReport]":
-    """Download the captures of a manifest into their folders, check them, and print what is done.
+    """Download the captures of a manifest, or only some sessions, into their folders; check them; print what is done.
 
-    Files already there are not fetched again.
-
-    Args:
-        manifest_path: YAML file with `captures` and a section `dataset`, see `toolkit.manifest`.
-        sessions: download only these sessions of the manifest; default: all.
-        dry_run: list what would be fetched, and write nothing.
-        overrides: `key=value` or `section.key=value`, in place of the manifest's values.
-
-    Returns:
-        The check report of each capture; empty on a dry run.
+    Files already there are not fetched again; on a dry run none is, only listed. `overrides` are `key=value` or
+    `section.key=value`, in place of the manifest's values. Return the check report of each capture.
 
     Raises:
         ManifestError: the manifest does not say where its captures are, or has no such session.

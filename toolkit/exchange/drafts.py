@@ -16,6 +16,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeAlias
 
@@ -56,16 +57,7 @@ from toolkit.exchange.recordings import (
     read_track,
     to_us,
 )
-from toolkit.files import (
-    IMPORTED,
-    MASKS,
-    own_name,
-    read_json,
-    recover_folder,
-    write_atomic,
-    write_folder,
-    write_text,
-)
+from toolkit.files import IMPORTED, MASKS, own_name, read_json, recover_folder, write_atomic, write_folder, write_text
 from toolkit.geometry import Floats, make_pose, scaled
 from toolkit.manifest import nearest
 
@@ -190,7 +182,6 @@ class Draft(Options):
     times_from: str = ""
     before: int = 0  # images in the session that these are added to
     old_times: frozenset[int] = frozenset()  # and their timestamps
-    prepared: Prepared | None = None
     sensors: dict[str, str] = field(default_factory=dict)  # id by `camera_text`, for images that are not in a rig
     started: float = field(default_factory=time.perf_counter)
 
@@ -216,8 +207,7 @@ class Draft(Options):
     def finish(self, held: Collection[str] | None = None) -> ImportReport:
         """Write the session without the images that cannot be used, and the queries that are held out of it.
 
-        Args:
-            held: the frames, or images without rigs, that become queries; None: every `hold_out`-th.
+        These are the frames `held`, or images without rigs; None: every `hold_out`-th.
 
         Raises:
             CaptureError: a session has no image left, or exists; none is written.
@@ -233,8 +223,8 @@ class Draft(Options):
         for draft in drafts:
             draft.follow()
             draft.leave_out()
-            draft.prepared = draft._prepare()  # all errors come before a session is written
-        if self.depth is not None and not any(draft.prepared and draft.prepared[-1] for draft in drafts):
+        depths = [draft.prepared[-1] for draft in drafts]  # all errors come before a session is written
+        if self.depth is not None and not any(depths):
             expected = f"that of {self.images[0].name} under the same name, or with `depth` for `color`"
             raise CaptureError(f"{self.depth}: no depth map of an image. Expected {expected}.")
         if self.listed_in:
@@ -293,8 +283,7 @@ class Draft(Options):
 
         If they do not tell it, the poses stay, and their unit is unknown.
         """
-        posed = [image for image in self.images if image.frame in self.poses and is_file(self.source(image.name))]
-        poses = self._camera_poses(posed)
+        poses = self._camera_poses([image for image in self.images if is_file(self.source(image.name))])
         turns = dict[str, int]()
         for name in poses:
             with suppress(ImageError):
@@ -310,9 +299,8 @@ class Draft(Options):
             self.notes += placed.notes or ["no photograph has GPS" if known is None else "no image has a position"]
             return
         rotation, scale = new_from_old.rotation.matrix(), new_from_old.scale
-        self.poses = {
-            frame: make_pose(rotation @ pose[:3, :3], new_from_old * pose[:3, 3]) for frame, pose in self.poses.items()
-        }
+        self.poses = {name: make_pose(rotation @ one[:3, :3], new_from_old * one[:3, 3]) for name, one in
+                      self.poses.items()}  # fmt: skip
         self.rigs = [(rig, sensor, make_pose(pose[:3, :3], scale * pose[:3, 3])) for rig, sensor, pose in self.rigs]
         self.record |= placed.record
         self.notes += placed.notes
@@ -328,11 +316,9 @@ class Draft(Options):
     def _camera_poses(self, images: Sequence[DraftImage]) -> dict[str, Floats]:
         """Return world_from_cam (4, 4) of images that have one, by name."""
         of_sensor = {(rig, sensor): rig_from_sensor for rig, sensor, rig_from_sensor in self.rigs}
-        return {
-            image.name: self.poses[image.frame] @ of_sensor[image.rig, image.sensor] if image.rig
-            else self.poses[image.frame]
-            for image in images if image.frame in self.poses
-        }  # fmt: skip
+        posed = {image.name: (image, self.poses[image.frame]) for image in images if image.frame in self.poses}
+        return {name: pose @ of_sensor[image.rig, image.sensor] if image.rig else pose
+                for name, (image, pose) in posed.items()}  # fmt: skip
 
     def _split(self, held: Collection[str]) -> "Draft":
         """Move some frames to the draft of a query session."""
@@ -361,14 +347,11 @@ class Draft(Options):
             units = f"{unit or 'unknown'}, that of the new ones {found or 'unknown'}"
             raise CaptureError(f"{self.session}: the unit of its poses is {units}.")
         self.record = {key: before[key] for key in before if key == "meters"} | self.record | {"unit": unit}
-        images, self.images = self.images, []
-        for image in images:
-            if known.isdisjoint((image.name, f"{image.name}.png")):
-                self.images.append(image)
-            else:
-                self.others.setdefault("in the session already", []).append(image.name)
-        if images and not self.images:
-            raise CaptureError(f"{self.session}: has all {len(images)} images already, so there is none to add.")
+        there = [image.name for image in self.images if {image.name, f"{image.name}.png"} & known]
+        if there and len(there) == len(self.images):
+            raise CaptureError(f"{self.session}: has all {len(there)} images already, so there is none to add.")
+        self.images = [image for image in self.images if {image.name, f"{image.name}.png"}.isdisjoint(known)]
+        self.others |= {"in the session already": there} if there else {}
         if not is_linked_here(self.session):  # links of others do not become the user's own
             self.placing = "copy"
         self.before, self.old_times = len(known), frozenset(old.images["timestamp"].tolist())
@@ -398,13 +381,11 @@ class Draft(Options):
         if folder is not None and not masks:
             first = self.images[0].name
             raise CaptureError(f"{folder}: no mask of {self.folder}. Expected that of {first} as {first}.png.")
-        for image in self.images:
-            size = stored_size(masks[image.name]) if image.name in masks else (image.camera.width, image.camera.height)
-            if size != (image.camera.width, image.camera.height):
-                self.notes.append(
-                    f"{masks[image.name]}: {size[0]} x {size[1]} pixels, expected {image.camera.width} x "
-                    f"{image.camera.height}, as {image.name}, which has no features until you correct its mask"
-                )
+        for image in (image for image in self.images if image.name in masks):
+            size, expected = stored_size(masks[image.name]), (image.camera.width, image.camera.height)
+            if size != expected:
+                pixels = f"{size[0]} x {size[1]} pixels, expected {expected[0]} x {expected[1]}, as {image.name}"
+                self.notes.append(f"{masks[image.name]}: {pixels}, which has no features until you correct its mask")
         return masks
 
     def leave_out(self) -> None:
@@ -417,8 +398,7 @@ class Draft(Options):
             if share[image.sensor] < MIN_INVERTIBLE and not problems[image.name]:
                 percent = f"{100 * (1 - share[image.sensor]):.0f} %"
                 problems[image.name] = f"the distortion of its camera cannot be inverted in {percent} of the image"
-        partly = [sensor for sensor, part in share.items() if MIN_INVERTIBLE <= part < 1]
-        if partly:
+        if partly := [sensor for sensor, part in share.items() if MIN_INVERTIBLE <= part < 1]:
             of = f"{', '.join(partly[:5])}{' and others' if len(partly) > 5 else ''} ({len(partly)} of {len(share)})"
             self.notes.append(f"distortion that cannot be inverted near the edge of the image: {of}")
         self.rows += [{"image": name, "status": problem} for name, problem in problems.items() if problem]
@@ -467,7 +447,8 @@ class Draft(Options):
         self.notes += notes
         return "; ".join(notes)
 
-    def _prepare(self) -> Prepared:
+    @cached_property
+    def prepared(self) -> Prepared:
         times = self._choose_times()
         return times, self._find_masks(), self._odometry(times), self._fix_rows(times), self._find_depths(times)
 
@@ -475,7 +456,7 @@ class Draft(Options):
         """Write the session; call `leave_out` before."""
         if turned := sum(image.turned for image in self.images):
             self.notes.append(f"{turned} images have an EXIF orientation, which is ignored: pixels are used as stored")
-        times, masks, odometry, fixes, depths = self.prepared or self._prepare()
+        times, masks, odometry, fixes, depths = self.prepared
         columns = ["image", "status", "path", "timestamp", "sensor_id", "device_id", "camera"]
         left_out = [(str(row["image"]), str(row["status"])) for row in self.rows]
         left_out += [(name, reason) for reason, names in self.others.items() for name in names]
@@ -514,14 +495,16 @@ class Draft(Options):
                 else:
                     target.symlink_to(os.path.abspath(source))  # noqa: PTH100 - must not resolve links in the source
             made = session / "new" if self.before else session
-            self._write_tables(made, times, odometry, fixes, depths.values())
-            listed = table
+            self._write_tables(made)
+            listed, list_file = table, session / "proc" / "import.csv"
             if self.before:
                 _append(made, session)
-                listed = pd.concat([_read_rows(session), table]).drop_duplicates("image", keep="last")
+                if list_file.exists():
+                    listed = pd.concat([pd.read_csv(list_file, dtype=str, keep_default_na=False), table])
+                    listed = listed.drop_duplicates("image", keep="last")
                 old = read_json(session / IMPORT_RECORD)
                 record = old | record | {"before": self.before, "up": old.get("up", record["up"])}
-            with write_atomic(session / "proc" / "import.csv") as temporary:
+            with write_atomic(list_file) as temporary:
                 listed.to_csv(temporary, index=False)
             if self.placing == "link" or (self.before and is_linked_here(self.session)):
                 note_linked_here(session)
@@ -574,21 +557,18 @@ class Draft(Options):
         files = [name for name in walk_files(folder)[0] if name.lower().endswith(".png")]
         files = [name for name in files if (folder / name).resolve() not in images]
         found = find_depths(folder, files, {image.name: times[image.frame] for image in self.images})
-        measured = ((found[image.name], image) for image in self.images if image.name in found)
         return {
-            file: (times[image.frame], self._depth_sensor(image.sensor), f"{SUBSESSION}/depth/{image.name}.png")
-            for file, image in measured
-        }
+            found[one.name]: (times[one.frame], self._depth_sensor(one.sensor), f"{SUBSESSION}/depth/{one.name}.png")
+            for one in self.images if one.name in found
+        }  # fmt: skip
 
     def _depth_sensor(self, sensor: str) -> str:
         folder, _, name = sensor.rpartition("/")
         return sensor if self.depth_camera is None else f"{folder}/{name.replace('cam', 'depth')}"
 
-    def _write_tables(
-        self, session: Path, times: Mapping[str, int], odometry: Trajectory | None = None,
-        fixes: Sequence[tuple[Any, ...]] = (), depths: Collection[tuple[int, str, str]] = (),
-    ) -> None:  # fmt: skip
-        """Write the text files of the capture format; `times` are the timestamps of the frames, microseconds."""
+    def _write_tables(self, session: Path) -> None:
+        """Write the text files of the capture format."""
+        times, _, odometry, fixes, depths = self.prepared
         frame_of = {(times[image.frame], image.device): image.frame for image in self.images}
         keys = pd.DataFrame(sorted(frame_of), columns=["timestamp", "device_id"])
         trajectory = None
@@ -607,16 +587,14 @@ class Draft(Options):
             write_table(session / "gps.txt", ", ".join(name for name, _ in COLUMNS["gps.txt"]),
                         (", ".join(map(str, row)) for row in fixes))  # fmt: skip
         write_session(
-            session,
-            sensors,
-            [row for row in self.rigs if row[0] in rigs and row[1] in cameras] or None,
+            session, sensors, [row for row in self.rigs if row[0] in rigs and row[1] in cameras] or None,
             trajectory if is_map else odometry,
             sorted((times[image.frame], image.sensor, image.path) for image in self.images),
-            depths=sorted(depths) or None,
+            depths=sorted(depths.values()) or None,
             subsessions=[SUBSESSION],
             keyframes=None if is_map else {"pruned_subsampled": keys},  # the list localized by default
             ground_truth=None if is_map else trajectory,
-        )
+        )  # fmt: skip
 
     def _problem(self, image: DraftImage) -> str:
         """Return why an image cannot be used, or an empty text. Set its time and orientation from its EXIF header."""
@@ -648,8 +626,7 @@ class Draft(Options):
         if abs(width * camera.height - height * camera.width) <= max(sides) / 2:  # equal ratio up to rounding
             factor = width / camera.width
             is_crop = 0.9 < factor < 1.1  # nobody resizes by so little; undistortion and stabilization crop
-            problem += "; it seems to be cropped" if is_crop else ""
-            problem += "; use images of the camera's size"
+            problem += f"{'; it seems to be cropped' if is_crop else ''}; use images of the camera's size"
             problem += "" if is_crop else f", or multiply its intrinsics by {factor:.6g}"
         if 4 < orientation <= 8 and size == (camera.height, camera.width):
             problem += "; the camera fits the rotated image: rotate the pixels and remove the EXIF orientation"
@@ -680,7 +657,8 @@ class Draft(Options):
 
 
 def start(capture: str | Path, device: str, split: str, folder: Path, **options: Any) -> Draft:
-    """Return the draft of a new session. Raise CaptureError if it exists, ManifestError for an invalid argument."""
+    """Return the draft of a new session. Raise CaptureError if it exists; ManifestError for an unknown split, placing
+    or axes, a length that is not positive, an invalid `hold_out` or device, or options that exclude each other."""
     may_exist = options.get("replace", False) or options.get("add", False)
     draft = Draft(_session(Path(capture), device, split, may_exist), folder, **options)
     if draft.add and (draft.replace or draft.gps):
@@ -729,11 +707,6 @@ def _append(made: Path, session: Path) -> None:
     shutil.rmtree(made)
 
 
-def _read_rows(session: Path) -> pd.DataFrame:
-    path = session / "proc" / "import.csv"
-    return pd.read_csv(path, dtype=str, keep_default_na=False) if path.exists() else pd.DataFrame({"image": []})
-
-
 def every_nth(frames: Sequence[str], number: int) -> set[str]:
     """Return every `number`-th of the frames, which becomes a query; none if it is 0.
 
@@ -748,10 +721,8 @@ def every_nth(frames: Sequence[str], number: int) -> set[str]:
 def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES, draft: Draft | None = None) -> list[str]:
     """Return the images in and below a folder, sorted by path. Links to folders elsewhere are followed, each once.
 
-    Sessions that an import has made are skipped, masks (see `images.find_mask`), and names that are not Unicode.
-
-    Args:
-        draft: gets the files that are left out, by the reason.
+    Sessions that an import has made are skipped, masks (see `images.find_mask`), and names that are not Unicode. The
+    draft gets the files that are left out, by the reason.
 
     Raises:
         CaptureError: there is no image.
@@ -763,9 +734,8 @@ def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES, draft:
     others = {"its name is not UTF-8: rename it": broken} if broken else {}
     for name in files:
         if (suffix := name[name.rfind(".") :].lower()) in PHOTOGRAPHS and suffix not in suffixes:
-            others.setdefault(f"{suffix} is not read: {HEIC_HOW if suffix in HEIC_SUFFIXES else CONVERT}", []).append(
-                name
-            )
+            how = HEIC_HOW if suffix in HEIC_SUFFIXES else CONVERT
+            others.setdefault(f"{suffix} is not read: {how}", []).append(name)
     note = [f"captures in the folder of images are skipped: {', '.join(captures[:3])}"] if captures else []
     if draft is not None:
         draft.others |= others

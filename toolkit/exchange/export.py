@@ -177,11 +177,8 @@ def export_table(session: Session, out: str | Path, ground_truth: bool = False) 
     """Write the cameras and poses of a session's images as the table that `interchange.import_images` reads.
 
     Image names are relative to the session's `raw_data`, poses are world_from_cam. If some images have poses, the
-    others are left out. If none has, the table has cameras only.
-
-    Args:
-        ground_truth: write the poses of `session.ground_truth`. Otherwise, map sessions have the poses of
-            `session.trajectory` and query sessions have none.
+    others are left out. If none has, the table has cameras only. With `ground_truth`, poses are those of
+    `session.ground_truth`; otherwise, map sessions have those of `session.trajectory` and query sessions none.
     """
     rows = session.camera_rows
     poses = session.world_from_cam(rows, ground_truth)
@@ -208,8 +205,7 @@ def export_pairs(
 ) -> int:  # fmt: skip
     """Write the retrieval of a pair in hloc's format, `query reference` per line, and return the number of lines.
 
-    Args:
-        topk: number of references per query; None: all retrieved ones.
+    Queries have `topk` references; None: all retrieved ones.
 
     Raises:
         ArtifactError: the run has no such retrieval, it is of older vectors, a line of it is malformed, a name contains

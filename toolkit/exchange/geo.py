@@ -30,10 +30,8 @@ _DENOMINATOR = 10**6  # of the seconds of arc: 0.03 mm
 
 def geo_table(run: str | Path, capture: str | Path | None = None) -> pd.DataFrame:
     """Return a row per query image of a run and map with an origin: `KEYS`, `georeference.GEO_COLUMNS`, `num_inliers`,
-    `position_std_m` and `path`, the file. The columns of the pose are NaN without a pose.
-
-    Args:
-        capture: its folder, if it has moved since the run.
+    `position_std_m` and `path`, the file. The columns of the pose are NaN without a pose. `capture` is its folder, if
+    it has moved since the run.
 
     Raises:
         CaptureError: no map has an origin.
@@ -76,8 +74,7 @@ def _table_of(results: PairResults, session: Any, origin: Floats, scene: str) ->
 def export_geo(run: str | Path, out: str | Path, capture: str | Path | None = None) -> int:
     """Write `geo_table` as CSV, or as GeoJSON (RFC 7946), where images without a pose have no geometry.
 
-    Returns:
-        The number of images with a pose.
+    Return the number of images with a pose.
 
     Raises:
         ManifestError: the file's name ends neither in .csv nor in .geojson; and as for `geo_table`.
@@ -102,13 +99,8 @@ def export_geo(run: str | Path, out: str | Path, capture: str | Path | None = No
 def export_exif(run: str | Path, out: str | Path, capture: str | Path | None = None, unsure: bool = False) -> int:
     """Write copies of the query pictures with position and direction in EXIF; the pixels of JPEGs stay byte for byte.
 
-    Of a picture that was localized in several maps, the pose with the most inliers is taken. Times and other tags stay.
-
-    Args:
-        unsure: also take poses of low confidence.
-
-    Returns:
-        The number of pictures.
+    Of a picture that was localized in several maps, the pose with the most inliers is taken; with `unsure`, also one of
+    low confidence. Times and other tags stay. Return the number of pictures.
 
     Raises:
         ManifestError: the folder `out` contains files.

@@ -105,9 +105,8 @@ def alignment(
     """Return how `place` would transform posed images, (4, 4) by name, and that similarity, new_from_old."""
     model = pycolmap.Reconstruction()
     for number, (name, world_from_cam) in enumerate(world_from_cams.items(), start=1):
-        model.add_camera_with_trivial_rig(
-            pycolmap.Camera(camera_id=number, model="SIMPLE_PINHOLE", width=2, height=2, params=[1, 1, 1])
-        )
+        camera = pycolmap.Camera(camera_id=number, model="SIMPLE_PINHOLE", width=2, height=2, params=[1, 1, 1])
+        model.add_camera_with_trivial_rig(camera)
         image = pycolmap.Image(name, camera_id=number, image_id=number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(invert(world_from_cam)[:3]))
     before = np.vstack([np.zeros(3), np.eye(3)])
@@ -179,9 +178,8 @@ def gps_position(path: Path) -> tuple[float, float, float] | None:
         with PIL.Image.open(path) as image:
             tags = image.getexif().get_ifd(_GPS_TAGS)
         degrees = [float(np.dot([float(value) for value in tags[key]], [1, 1 / 60, 1 / 3600])) for key in (2, 4)]
-        latitude, longitude = (
-            value * (-1 if str(tags[key]).upper() in "SW" else 1) for key, value in zip((1, 3), degrees, strict=True)
-        )
+        latitude, longitude = (value * (-1 if str(tags[key]).upper() in "SW" else 1)
+                               for key, value in zip((1, 3), degrees, strict=True))  # fmt: skip
         altitude = float(tags.get(6, 0.0)) * (-1 if tags.get(5) in (1, b"\x01") else 1)
     except (*HEADER_ERRORS, KeyError, TypeError, ZeroDivisionError):
         return None
@@ -214,10 +212,8 @@ def _point(model: pycolmap.Reconstruction, images: Mapping[str, pycolmap.Image],
     except ValueError:
         xy = np.zeros(0)
     if image is None or xy.shape != (2,):
-        some = ", ".join(list(images)[:3])
-        raise ManifestError(
-            f"distance: found {text!r}, expected IMAGE or IMAGE:x,y with an image of the model: {some}."
-        )
+        expected = f"IMAGE or IMAGE:x,y with an image of the model: {', '.join(list(images)[:3])}"
+        raise ManifestError(f"distance: found {text!r}, expected {expected}.")
     if not colon:
         return np.asarray(image.projection_center())
     camera, world_from_cam = image.camera, image.cam_from_world().inverse()
@@ -226,9 +222,8 @@ def _point(model: pycolmap.Reconstruction, images: Mapping[str, pycolmap.Image],
     away = np.linalg.norm(np.array([point.xy for point in seen]).reshape(-1, 2) - xy, axis=1)
     near = [seen[index] for index in np.argsort(away, kind="stable")[:5] if away[index] < NEAR_PX * camera.width]
     if not near:
-        raise ManifestError(
-            f"distance: the model has no point near {text}. Choose a corner or a pattern, no plain area."
-        )
+        do = "Choose a corner or a pattern, no plain area."
+        raise ManifestError(f"distance: the model has no point near {text}. {do}")
     depths = np.array([(image.cam_from_world() * model.points3D[point.point3D_id].xyz)[2] for point in near])
     if depths.max() > MAX_DEPTHS * depths.min():
         apart = 100 * (depths.max() / depths.min() - 1)
@@ -243,7 +238,6 @@ def east_north_up(positions: Floats, origin: Floats) -> Floats:
 
     WGS 84 to Earth-centered, Earth-fixed coordinates and to local ones, B. Hofmann-Wellenhof et al., "GNSS", 2008.
     """
-
     return (_earth_fixed(positions) - _earth_fixed(origin)) @ _local_axes(origin).T
 
 

@@ -6,7 +6,7 @@ given; its name is the first part of the names of its images.
 
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 
@@ -21,15 +21,15 @@ from toolkit.capture.names import is_linked_here, note_linked_here
 from toolkit.capture.session import RAW_DATA
 from toolkit.capture.tables import write_table
 from toolkit.errors import CaptureError
-from toolkit.exchange.drafts import Draft, DraftImage
+from toolkit.exchange.drafts import Draft
 from toolkit.exchange.import_report import ImportReport
 from toolkit.exchange.photographs import Photograph, gather, initial_cameras
-from toolkit.exchange.reconstruct import FOLDER, RATIO, RECORD, UNIT_HINT, _hand_over, _Mutual, _quiet, _reasons, _Work
+from toolkit.exchange.reconstruct import FOLDER, RATIO, RECORD, _hand_over, _Mutual, _quiet, _reasons, _Work, add_posed
 from toolkit.features.features import KINDS
 from toolkit.features.matching import LocalMethod
 from toolkit.features.sift import SiftExtractor
 from toolkit.files import IMPORTED, MASKS, own_name, read_json, write_atomic, write_folder, write_text
-from toolkit.geometry import Ints, make_pose
+from toolkit.geometry import Ints
 from toolkit.store.items import heals
 
 
@@ -37,10 +37,7 @@ from toolkit.store.items import heals
 def add_recording(
     sources: Sequence[str | Path], capture: str | Path, device: str = "ios", fps: float | None = None
 ) -> ImportReport:
-    """Register photographs into the model of a capture and add them to its map session.
-
-    Args:
-        sources, capture, device, fps: as for `reconstruct`; the map session was made by it.
+    """Register photographs into the model of a capture and add them to its map session, both made by `reconstruct`.
 
     Raises:
         CaptureError: the session was not reconstructed, all photographs are in it already, or none fits into its model.
@@ -68,7 +65,12 @@ def add_recording(
         raise CaptureError(f"{sources[0]}: no photograph fits into the model. {next(iter(reasons.items()))}.")
     item_of = dict(zip(work.names, work.photographs, strict=True))
     draft = Draft(session, folder, add=True, record={"source": ", ".join(map(str, sources))})
-    report = _append(draft, sorted(added, key=lambda image: image.image_id), item_of, reasons)
+    for image in sorted(added, key=lambda image: image.image_id):
+        add_posed(draft, item_of[image.name], image, f"{image.camera_id}", "estimated with the model")
+    draft.rows = [{"image": name, "status": why} for name, why in reasons.items()]
+    draft.follow()
+    draft.leave_out()
+    report = draft.write()
     _finish(folder, session, model)
     _hand_over(work, session)
     return report
@@ -90,8 +92,10 @@ def remove_recording(name: str, capture: str | Path, device: str = "ios") -> str
     keys = {(str(row["timestamp"]), row["sensor_id"]) for row, one in
             zip(opened.images.to_dict("records"), opened.image_names, strict=True) if one in gone}  # fmt: skip
     with write_folder(session, replace=True, keep=True) as changed:
-        for file in ("images.txt", "trajectories.txt"):
-            _rewrite(changed / file, lambda cells: (cells[0], cells[1]) not in keys)
+        for path in (changed / "images.txt", changed / "trajectories.txt"):
+            rows = ((line, line.split(",")) for line in path.read_text(encoding="utf-8").splitlines())
+            kept = [line for line, cells in rows if line.startswith("#") or (*map(str.strip, cells[:2]),) not in keys]
+            write_table(path, None, kept)
         for one in gone:
             (changed / RAW_DATA / one.partition(f"/{RAW_DATA}/")[2]).unlink(missing_ok=True)
         table = pd.read_csv(changed / "proc" / "import.csv", dtype=str, keep_default_na=False)
@@ -189,34 +193,6 @@ def _register(work: _Work, base: pycolmap.Reconstruction, fixed: set[int]) -> py
         moved = model.image(number).cam_from_world()
         assert np.allclose(moved.matrix(), pose.matrix(), atol=1e-6), "the mapper has moved an image of the model"
     return model
-
-
-def _append(
-    draft: Draft, added: Sequence[pycolmap.Image], item_of: Mapping[str, Photograph], reasons: Mapping[str, str]
-) -> ImportReport:
-    """Add images of the model to a session."""
-    draft.convention, draft.unit_hint = "found by structure from motion", UNIT_HINT
-    for image in added:
-        item, pose = item_of[image.name], image.cam_from_world().inverse()
-        assert image.camera is not None
-        draft.images.append(
-            DraftImage(item.name, image.camera, f"{image.camera_id}", item.name, origin="estimated with the model")
-        )
-        draft.poses[item.name] = make_pose(pose.rotation.matrix(), pose.translation)
-        draft.sources[item.name] = item.path
-        if item.mask is not None:
-            draft.mask_files[item.name] = item.mask
-    draft.rows = [{"image": name, "status": why} for name, why in reasons.items()]
-    draft.follow()
-    draft.leave_out()
-    return draft.write()
-
-
-def _rewrite(path: Path, keep: Callable[[list[str]], bool]) -> None:
-    """Write the lines of a table again that a function of their cells keeps."""
-    lines = path.read_text(encoding="utf-8").splitlines()
-    kept = [line for line in lines if line.startswith("#") or keep([cell.strip() for cell in line.split(",")])]
-    write_table(path, None, kept)
 
 
 def _finish(folder: Path, session: Path, model: pycolmap.Reconstruction) -> None:

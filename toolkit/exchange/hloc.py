@@ -37,11 +37,7 @@ _HALF_PIXEL = np.float32(0.5)
 
 
 def export_features(run: str | Path, scene: str, session: str, out: str | Path, kind: str = "sift") -> int:
-    """Write the features of a session as a file of hloc, and return the number of images.
-
-    Args:
-        session: such as `ios_map`.
-        kind: of the features.
+    """Write the features of a session, such as `ios_map`, as a file of hloc, and return the number of images.
 
     Raises:
         ArtifactError: the run has no such features, or several.
@@ -108,7 +104,6 @@ def export_matches(
 
     Args:
         session0, session1: such as `ios_query` and `ios_map`; twice the same for the pairs of a map.
-        kind: of the features.
         capture: new folder of a capture that has moved; needed for the pairs of a map.
 
     Raises:
@@ -160,10 +155,7 @@ def _matches_to_hloc(matches: PairMatches, count: int) -> dict[str, NDArray[Any]
 
 
 def import_matches(path: str | Path, pairs: Iterable[tuple[str, str]], out: str | Path) -> MatchStore:
-    """Copy matches of pairs of images from a file of hloc to a folder, and return its content.
-
-    Args:
-        pairs: names of the two images, in either order; the file does not tell them.
+    """Copy matches of pairs of images, by name in either order, from a file of hloc to a folder; return its content.
 
     Raises:
         ArtifactError: the file is missing, torn or of another layout, or lacks a pair.

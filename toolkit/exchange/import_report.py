@@ -93,11 +93,7 @@ def _rows(record: Mapping[str, Any]) -> Iterator[tuple[str, int | None, str]]:
 
 
 def grouped(left_out: Iterable[tuple[str, str]]) -> list[dict[str, Any]]:
-    """Return the count, the reason and the first name of images left out for reasons that differ only in numbers.
-
-    Args:
-        left_out: names and reasons.
-    """
+    """Return the count, the reason and the first name of images whose reasons differ only in numbers, given both."""
     groups = dict[str, dict[str, Any]]()
     for name, reason in left_out:
         key = re.sub(r"\d[\d.e+-]*", "#", reason.replace(name, ""))
@@ -108,8 +104,7 @@ def grouped(left_out: Iterable[tuple[str, str]]) -> list[dict[str, Any]]:
 def cameras_of(images: Iterable[tuple[str, pycolmap.Camera, str]]) -> list[dict[str, Any]]:
     """Return what a report says of cameras: those of equal model, size and origin together.
 
-    Args:
-        images: sensor, camera, and where its intrinsics are from, of each image.
+    `images` are sensor, camera, and where its intrinsics are from, of each image.
     """
     groups = dict[tuple[Any, ...], list[tuple[str, float]]]()
     for sensor, camera, origin in images:

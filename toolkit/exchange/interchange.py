@@ -23,12 +23,7 @@ from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.images import decode, exif_camera
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import COMMAND, CaptureError, ImageError, ManifestError
-from toolkit.exchange.colmap_model import (
-    NORM_TOLERANCE,
-    inverse,
-    read_cameras,
-    read_model,
-)
+from toolkit.exchange.colmap_model import NORM_TOLERANCE, inverse, read_cameras, read_model
 from toolkit.exchange.drafts import (
     HEIC_SUFFIXES,
     READ_SUFFIXES,
@@ -79,27 +74,21 @@ def import_colmap(
 
     Raises:
         CaptureError: no model in the folder, or a damaged one; the session exists already, or no image is left.
-        ManifestError: an unknown split, placing or axes, a unit that is not a positive length, an invalid `hold_out`,
-            or a device that cannot be part of a name.
+        ManifestError: as for `drafts.start`.
     """
     draft = start(capture, device, split, Path(images), **options)
     content = read_model(Path(model))
     draft.notes += content.notes
     draft.convention, draft.listed_in = "cam_from_world of the model", "the model"
     draft.frames_are_names = False
-    rig_of_image = {
-        image_id: (frame_id, frame)
-        for frame_id, frame in content.frames.items()
-        for image_id in frame.image_ids
-        if frame.rig_id in content.rigs
-    }
+    of_rigs = ((frame_id, frame) for frame_id, frame in content.frames.items() if frame.rig_id in content.rigs)
+    rig_of_image = {image_id: (frame_id, frame) for frame_id, frame in of_rigs for image_id in frame.image_ids}
     sensors = _sensors_of_rigs(content.rigs)
-    for rig_id, cameras in sorted(content.rigs.items()):
-        calibrated = {camera_id: pose for camera_id, pose in sorted(cameras.items()) if pose is not None}
-        draft.rigs += [
-            (f"{SUBSESSION}/rig_{rig_id}", sensors[rig_id, camera_id], inverse(sensor_from_rig))
-            for camera_id, sensor_from_rig in calibrated.items()
-        ]
+    draft.rigs = [
+        (f"{SUBSESSION}/rig_{rig_id}", sensors[rig_id, camera_id], inverse(sensor_from_rig))
+        for rig_id, cameras in sorted(content.rigs.items())
+        for camera_id, sensor_from_rig in sorted(cameras.items()) if sensor_from_rig is not None
+    ]  # fmt: skip
     moved, names = 0, set[str]()
     for image_id, image in sorted(content.images.items()):
         frame_id, frame = rig_of_image.get(image_id, (f"image {image_id}", None))  # a frame may have the same number
@@ -110,9 +99,8 @@ def import_colmap(
             sensor_from_rig = content.rigs[frame.rig_id].get(image.camera_id)
             pose = "its camera has no pose in its rig" if sensor_from_rig is None else frame.rig_from_world
             if not (sensor_from_rig is None or isinstance(pose, str) or isinstance(image.cam_from_world, str)):
-                moved += not np.allclose(
-                    (sensor_from_rig * pose).matrix(), image.cam_from_world.matrix(), rtol=1e-4, atol=1e-4
-                )
+                by_rig, own = (sensor_from_rig * pose).matrix(), image.cam_from_world.matrix()
+                moved += not np.allclose(by_rig, own, rtol=1e-4, atol=1e-4)
         if image.name in names:
             draft.rows.append({"image": image.name, "status": "its name occurs twice in the model"})
         elif isinstance(camera, str) or isinstance(pose, str):
@@ -155,8 +143,7 @@ def import_images(
     Raises:
         CaptureError: a malformed table or camera (names file and line), an image without intrinsics, a map without
             poses, truth that names no image, the session exists already, or no image is left.
-        ManifestError: an unknown split, placing, direction or axes, a unit that is not a positive length, truth for a
-            map or together with poses in the table, or a device that cannot be part of a name.
+        ManifestError: an unknown direction, truth for a map or together with poses in the table; as for `drafts.start`.
     """
     if poses_are not in POSE_DIRECTIONS:
         raise ManifestError(f"poses_are: unknown {poses_are!r}. {nearest(poses_are, POSE_DIRECTIONS)}")
@@ -246,8 +233,7 @@ def import_once(
 def once(session: Path, inputs: Mapping[str, Any], make: Callable[[dict[str, Any]], ImportReport]) -> str:
     """Make a session, unless it was made before from the same inputs. Return a message for the user.
 
-    Args:
-        make: takes what `proc/import.json` is to have, see `drafts.Options`.
+    `make` takes what `proc/import.json` is to have, see `drafts.Options`.
 
     Raises:
         CaptureError: the session was made from other inputs; names them.
@@ -287,8 +273,7 @@ def _sensors_of_rigs(rigs: Mapping[int, Mapping[int, pycolmap.Rigid3d | None]]) 
 def _listed(draft: Draft, folder: Path, only: Sequence[str], skip: Sequence[str]) -> list[str]:
     """Return the images of a folder that fit the patterns, and note what is left out or looks like no photograph."""
     names = list_images(folder, (*READ_SUFFIXES, *(HEIC_SUFFIXES if heic_is_read() else ())), draft)
-    chosen = [name for name in names if not only or any(_fits(name, pattern) for pattern in only)]
-    chosen = [name for name in chosen if not any(_fits(name, pattern) for pattern in skip)]
+    chosen = [name for name in names if (not only or _fits(name, only)) and not _fits(name, skip)]
     if not chosen:
         raise CaptureError(f"{folder}: none of {len(names)} images fits the patterns {', '.join([*only, *skip])}.")
     if len(chosen) < len(names):
@@ -302,8 +287,8 @@ def _listed(draft: Draft, folder: Path, only: Sequence[str], skip: Sequence[str]
     return chosen
 
 
-def _fits(name: str, pattern: str) -> bool:
-    return fnmatch(name, pattern) or fnmatch(Path(name).name, pattern)
+def _fits(name: str, patterns: Sequence[str]) -> bool:
+    return any(fnmatch(one, pattern) for pattern in patterns for one in (name, Path(name).name))
 
 
 def _is_no_photograph(path: Path) -> bool:

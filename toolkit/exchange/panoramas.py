@@ -56,7 +56,8 @@ def import_panoramas(
     if twice := [name for name, count in stems.items() if count > 1]:
         raise CaptureError(f"{folder}: two panoramas have the name {twice[0]}. Rename one.")
     sizes: dict[int, int] = {}
-    with tempfile.TemporaryDirectory(dir=_existing_parent(Path(capture))) as temporary:
+    parent = next(one for one in (Path(capture).absolute(), *Path(capture).absolute().parents) if one.is_dir())
+    with tempfile.TemporaryDirectory(dir=parent) as temporary:
         out = Path(temporary)
 
         def cut(name: str) -> int | str:
@@ -73,9 +74,9 @@ def import_panoramas(
             size = sizes.setdefault(side, len(sizes) + 1)
             params = [side / 2, side / 2, side / 2, side / 2]
             camera = pycolmap.Camera(model="PINHOLE", width=side, height=side, params=params)
+            rig = f"{SUBSESSION}/panorama_{size}"
             for yaw in YAWS_DEG:
                 view = (Path(name).with_suffix("") / f"{yaw:03d}.jpg").as_posix()
-                rig = f"{SUBSESSION}/panorama_{size}"
                 draft.images.append(DraftImage(view, camera, f"{rig}_{yaw:03d}", name, rig, "a view of 90 degrees"))
                 draft.sources[view] = out / view
             if name in poses:
@@ -88,10 +89,6 @@ def import_panoramas(
                            for yaw, rotation in _rig_from_views()]  # fmt: skip
         draft.convention = poses_are
         return draft.finish()
-
-
-def _existing_parent(path: Path) -> Path:
-    return next(one for one in (path.absolute(), *path.absolute().parents) if one.is_dir())
 
 
 def _rig_from_views() -> Iterator[tuple[int, Floats]]:
@@ -131,9 +128,7 @@ def _cut(path: Path, out: Path, masks: Path | None) -> int:
     return side
 
 
-def pixels_in_panorama(
-    side: int, rig_from_view: Floats, width: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+def pixels_in_panorama(side: int, rig_from_view: Floats, width: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return for each pixel of a view of 90 degrees, (side, side), its column and row in a panorama, as cv2.remap does:
     the center of the top-left pixel is (0, 0)."""
     across = (np.arange(side) + 0.5) / (side / 2) - 1

@@ -1,5 +1,6 @@
 """Gather photographs for a reconstruction: files, folders and frames of videos, with what their EXIF tags tell."""
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +12,7 @@ import pycolmap
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from toolkit.capture.images import (
-    HEADER_ERRORS,
-    exif_camera,
-    exif_key,
-    find_mask,
-    read_header,
-)
+from toolkit.capture.images import HEADER_ERRORS, exif_camera, exif_key, find_mask, read_header
 from toolkit.errors import CaptureError, ImageError
 from toolkit.exchange.drafts import (
     CONVERTED_SUFFIXES,
@@ -103,10 +98,8 @@ def _files(sources: Sequence[Path], made: Path, fps: float | None, prefixed: boo
         elif source.is_file() and source.suffix.lower() in TAKEN_SUFFIXES:
             yield source.name, source
         else:
-            expected = ", ".join(TAKEN_SUFFIXES)
-            raise CaptureError(
-                f"{source}: no folder, image or video. Expected a folder, or a file ending in {expected}."
-            )
+            expected = f"Expected a folder, or a file ending in {', '.join(TAKEN_SUFFIXES)}"
+            raise CaptureError(f"{source}: no folder, image or video. {expected}.")
 
 
 def _converted(name: str, path: Path, made: Path) -> tuple[str, Path]:
@@ -163,13 +156,11 @@ def choose_frames(video: Path, fps: float | None = None) -> Iterator[tuple[int, 
         if not ok:
             break
         found += 1
-        size = _SMALL, max(1, round(_SMALL * frame.shape[0] / frame.shape[1]))
-        gray = np.asarray(
-            cv2.cvtColor(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY), np.uint8
+        small = cv2.resize(
+            frame, (_SMALL, max(1, round(_SMALL * frame.shape[0] / frame.shape[1]))), interpolation=cv2.INTER_AREA
         )
-        if reference is None:  # the first frame opens the video
-            share = 1.0
-        else:
+        gray, share = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8), 1.0
+        if reference is not None:  # the first frame opens the video
             share = _motion(reference, gray) / STEP if fps is None else (number - start) * fps / rate
         sharp = float(cv2.Laplacian(gray, cv2.CV_64F).var())
         if share >= 0.5 and sharp > score:
@@ -208,15 +199,12 @@ def initial_cameras(
     photographs = list(photographs)
     sizes = [read_header(item.path)[0] for item in photographs]
     folders = [Path(item.name).parent for item in photographs]
-    mixed = {
-        folder: len({size for size, other in zip(sizes, folders, strict=True) if other == folder}) > 2
-        for folder in set(folders)
-    }
+    different = Counter(folder for folder, _ in {*zip(folders, sizes, strict=True)})
     keys: dict[Any, int] = {}
     numbers, cameras = list[int](), list[pycolmap.Camera]()
     for index, (item, size, folder) in enumerate(zip(photographs, sizes, folders, strict=True)):
         tags = exif_key(item.exif)
-        key = folder, size, tags, index if mixed[folder] and not any(tags) else None
+        key = folder, size, tags, index if different[folder] > 2 and not any(tags) else None
         if key not in keys:
             keys[key] = len(cameras)
             cameras.append(given if given is not None else _initial(item.path, size))

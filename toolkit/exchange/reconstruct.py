@@ -12,6 +12,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from toolkit.capture.cameras import camera_text
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.embedders.vlad import Vlad
 from toolkit.errors import CaptureError, ManifestError, WeightsError
+from toolkit.exchange.colmap_model import inverse
 from toolkit.exchange.drafts import SUBSESSION, Draft, DraftImage, every_nth, list_images, start
 from toolkit.exchange.georeference import RECORD, place, read_positions
 from toolkit.exchange.import_report import ImportReport
@@ -43,7 +45,7 @@ from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import FeatureStore, extract_session, match_sessions
 from toolkit.features.verification import epipolar_matches
 from toolkit.files import IMPORTED, files_fingerprint, link_folder, write_text
-from toolkit.geometry import Floats, Ints, make_pose, unit
+from toolkit.geometry import Floats, Ints, unit
 from toolkit.manifest import LocalizeSettings, SiftSettings
 from toolkit.scene.query import FOCAL_PRIOR
 from toolkit.store.items import Items, heals
@@ -89,11 +91,8 @@ class _Mutual(MutualMatcher):
         return {**super().settings, "strongest": self.strongest}
 
     def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
-        distinct = {id(features): features for pair in pairs for features in pair}
-        units = {
-            key: unit_descriptors(features.descriptors[: self.strongest], self.shorten)
-            for key, features in distinct.items()
-        }
+        distinct = {id(one): one.descriptors[: self.strongest] for pair in pairs for one in pair}
+        units = {key: unit_descriptors(descriptors, self.shorten) for key, descriptors in distinct.items()}
         return list(prefetch(lambda pair: self.match_unit(*(units[id(one)] for one in pair)), pairs, default_workers()))
 
 
@@ -157,12 +156,12 @@ class _Work:
     def similarity(self) -> Floats:
         """(N, N) similarity of images by VLAD, -1 on the diagonal and for images without features."""
         store = self.kinds[0][1]
-        names = [name for name in self.names if name in store]
+        rows = [row for row, name in enumerate(self.names) if name in store]
+        names = [self.names[row] for row in rows]
         vlad = Vlad.learn(
             lambda: tqdm((store[name] for name in names), "vocabulary", len(names), unit="image"), len(names)
         )
         vectors = np.zeros((len(self), vlad.dim), np.float32)
-        rows = [row for row, name in enumerate(self.names) if name in store]
         vectors[rows] = list(prefetch(lambda name: vlad.embed([store[name]])[0], names, default_workers()))
         vectors = unit(vectors, 1e-9)
         similarity = (vectors @ vectors.T).astype(np.float64)
@@ -173,14 +172,10 @@ class _Work:
         """Return the pairs to match: all, or those of neighbors and of images that look similar."""
         count = len(self)
         if count <= ALL_PAIRS:
-            return [(i, j) for i in range(count) for j in range(i + 1, count)]
+            return [*combinations(range(count), 2)]
         folders = [Path(item.name).parent for item in self.photographs]
-        pairs = {
-            (i, j)
-            for i in range(count)
-            for j in range(i + 1, min(i + 1 + NEIGHBORS, count))
-            if folders[i] == folders[j]
-        }
+        near = (range(i + 1, min(i + 1 + NEIGHBORS, count)) for i in range(count))
+        pairs = {(i, j) for i, others in enumerate(near) for j in others if folders[i] == folders[j]}
         for i, similar in enumerate(np.argsort(-self.similarity, axis=1, kind="stable")[:, :SIMILAR].tolist()):
             pairs |= {(min(i, j), max(i, j)) for j in similar}
         return sorted(pairs)
@@ -294,9 +289,8 @@ class _Work:
 
         Images `fixed`, by their ids, keep their poses and cameras.
         """
-        scale = max(
-            1.0, max(max(camera.width, camera.height) for camera in self.cameras) / SiftSettings().max_long_side
-        )
+        longest = max(max(camera.width, camera.height) for camera in self.cameras)
+        scale = max(1.0, longest / SiftSettings().max_long_side)
         options = pycolmap.BundleAdjustmentOptions(print_summary=False, min_track_length=2)
         options.refine_focal_length = options.refine_extra_params = not self.fixed
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
@@ -387,26 +381,19 @@ def reconstruct(
     model = models[0]
     geo = {item.name: item.geo for item in work.photographs if item.geo is not None}
     placed = place(model, {item.name: item.quarter_turns for item in work.photographs}, geo, distance, known)
-    folder_of_models = folder / "models"
-    shutil.rmtree(folder_of_models)
-    for number, each in enumerate(models):
-        (folder_of_models / str(number)).mkdir(parents=True)
-        each.write(str(folder_of_models / str(number)))
-    sensors = {
-        camera_id: f"{SUBSESSION}/cam_{number}" for number, camera_id in enumerate(sorted(model.cameras), start=1)
-    }
+    paths = [folder / "models" / str(number) for number in range(len(models))]
+    shutil.rmtree(folder / "models")
+    for path, each in zip(paths, models, strict=True):
+        path.mkdir(parents=True)
+        each.write(str(path))
+    sensors = {number: f"{SUBSESSION}/cam_{at}" for at, number in enumerate(sorted(model.cameras), start=1)}
     images = {image.name: image for image in model.images.values() if image.has_pose}
     for name, item, number in zip(work.names, work.photographs, work.camera_of, strict=True):
         if name in images:
             image, known_focal = images[name], work.cameras[number].has_prior_focal_length
             origin = f"estimated, started at {'EXIF' if known_focal else f'{FOCAL_PRIOR} times the longer side'}"
             origin = "given by --camera" if given is not None else origin
-            draft.images.append(DraftImage(item.name, image.camera, sensors[image.camera_id], item.name, origin=origin))
-            pose = image.cam_from_world().inverse()
-            draft.poses[item.name] = make_pose(pose.rotation.matrix(), pose.translation)
-            draft.sources[item.name] = item.path
-            if item.mask is not None:
-                draft.mask_files[item.name] = item.mask
+            add_posed(draft, item, image, sensors[image.camera_id], origin)
     draft.rows += [{"image": name, "status": reason} for name, reason in _reasons(work, models).items()]
     sizes, error_px = [each.num_reg_images() for each in models], model.compute_mean_reprojection_error()
     record = {
@@ -416,14 +403,10 @@ def reconstruct(
         "reprojection error, px": error_px, **placed.record,
     }  # fmt: skip
     draft.record |= {"source": ", ".join(map(str, sources)), **placed.record}
-    draft.unit_hint = UNIT_HINT
-    draft.convention = "found by structure from motion"
     draft.notes += [f"{sizes[0]} of {record['photographs']} photographs in the model, {record['points']} points, "
                     f"reprojection error {error_px:.2f} px", *notes]  # fmt: skip
     if sizes[1:]:
-        where = ", ".join(
-            f"{size} in {folder_of_models / str(number)}" for number, size in enumerate(sizes[1:], start=1)
-        )
+        where = ", ".join(f"{size} in {path}" for size, path in zip(sizes[1:], paths[1:], strict=True))
         draft.notes.append(f"not connected to it, so not used: models of {where}")
     draft.notes += placed.notes
     report = draft.finish({name for name in held if name in draft.poses})
@@ -436,14 +419,21 @@ def reconstruct(
     return Reconstruction(report, xyz.reshape(-1, 3), rgb.reshape(-1, 3), option)
 
 
+def add_posed(draft: Draft, item: Photograph, image: pycolmap.Image, sensor: str, origin: str) -> None:
+    """Add a photograph with its camera and pose in a model to a session."""
+    draft.convention, draft.unit_hint = "found by structure from motion", UNIT_HINT
+    assert image.camera is not None
+    draft.images.append(DraftImage(item.name, image.camera, sensor, item.name, origin=origin))
+    draft.poses[item.name] = inverse(image.cam_from_world())
+    draft.sources[item.name] = item.path
+    if item.mask is not None:
+        draft.mask_files[item.name] = item.mask
+
+
 def reconstruct_once(
     photographs: str | Path, capture: str | Path, device: str = "ios", hold_out: int = 0, camera: str | None = None
 ) -> str:
-    """Reconstruct, unless it was done before from the same photographs. Return a message for the user.
-
-    Args:
-        photographs: an image file, a folder of images, or a video.
-        capture, device, hold_out, camera: see `reconstruct`.
+    """Reconstruct an image file, a folder of images or a video, unless it was done before. Return a message to show.
 
     Raises:
         CaptureError: the session was made from other input (the message names it); or as for `reconstruct`.
@@ -489,18 +479,13 @@ def _escalate(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> list[st
 
 def _reasons(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> dict[str, str]:
     """Return why each photograph that is not in the largest model is left out, by name."""
-    member = {
-        image.name: number
-        for number, model in reversed(list(enumerate(models)))
-        for image in model.images.values()
-        if image.has_pose
-    }
+    numbered = reversed([*enumerate(models)])  # the largest comes last, and wins
+    member = {image.name: number for number, model in numbered for image in model.images.values() if image.has_pose}
     inliers, reasons = work.inliers(), dict(work.unusable)
     inside = np.array([member.get(name) == 0 for name in work.names])
     for image, (name, item) in enumerate(zip(work.names, work.photographs, strict=True)):
         if inside[image] or item.name in reasons:
             continue
-        best = int(inliers[image].argmax())
         if name in member:
             size = models[member[name]].num_reg_images()
             reason = f"not connected: in model {member[name]}, of {size} photographs"
@@ -508,10 +493,8 @@ def _reasons(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> dict[str
             most = max((count for pair, count in work.matched.items() if image in pair), default=0)
             reason = f"no matches: at most {most} with another photograph, and these agree with no motion of the camera"
         elif not inliers[image][inside].any():
-            other = work.photographs[best].name
-            reason = (
-                f"not connected: matches {np.count_nonzero(inliers[image])} photographs, as {other}, none in the model"
-            )
+            count, other = np.count_nonzero(inliers[image]), work.photographs[int(inliers[image].argmax())].name
+            reason = f"not connected: matches {count} photographs, as {other}, none in the model"
         else:
             reason = f"no pose: its {inliers[image][inside].max()} matches with the model's photographs agree with none"
         reasons[item.name] = reason

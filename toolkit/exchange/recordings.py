@@ -93,8 +93,7 @@ def read_csv(path: Path) -> pd.DataFrame:
 
 
 def numbers_in(rows: pd.DataFrame, columns: Sequence[str], path: Path) -> Floats:
-    """Return columns of a table, see `read_csv`, as numbers. Raise CaptureError if one is missing or has another value.
-    """
+    """Return columns of a table, see `read_csv`, as numbers. Raise CaptureError if one is missing or no number."""
     table = rows.reindex(columns=columns).apply(pd.to_numeric, errors="coerce").to_numpy(float)
     for row in np.flatnonzero(~np.isfinite(table).all(axis=1)).tolist():
         found = ", ".join(map(str, rows.iloc[row, :-1]))
@@ -104,13 +103,9 @@ def numbers_in(rows: pd.DataFrame, columns: Sequence[str], path: Path) -> Floats
 
 def numbers_of(where: str, words: Sequence[str], count: int) -> Floats:
     """Return the first `count` words as numbers. Raise CaptureError, which names `where`, if they are none."""
-    try:
-        values = np.array([float(word) for word in words[:count]])
-        if len(values) == count:
-            return values
-    except ValueError:
-        pass
-    raise CaptureError(f"{where}: found {' '.join(words)[:80]!r}, expected {count} numbers.")
+    if len(words) < count or not all(map(is_number, words[:count])):
+        raise CaptureError(f"{where}: found {' '.join(words)[:80]!r}, expected {count} numbers.")
+    return np.array([float(word) for word in words[:count]])
 
 
 def to_us(times: Iterable[str | float], unit: str | None, where: object, near_us: Iterable[int] = ()) -> Ints:
@@ -183,9 +178,7 @@ def lines_of_images(names: Sequence[str], count: int) -> list[int] | None:
     return lines if len(set(lines)) == len(names) and max(lines) < count else None
 
 
-def read_track(
-    path: Path, unit: str | None, times: Path | None = None, near_us: Iterable[int] = ()
-) -> Track | None:  # fmt: skip
+def read_track(path: Path, unit: str | None, times: Path | None = None, near_us: Iterable[int] = ()) -> Track | None:
     """Read a list of poses without names of images; None if the file is something else.
 
     A line has 8 numbers: time, position, qx qy qz qw (TUM), or of nanoseconds and commas: qw qx qy qz, which may be
@@ -268,22 +261,16 @@ def read_fixes(path: Path) -> pd.DataFrame:
 
 
 def find_depths(folder: Path, files: Sequence[str], times_us: Mapping[str, int]) -> dict[str, Path]:
-    """Return the depth maps of images, by the name of the image.
+    """Return the depth maps of images with `times_us`, by the name of the image; `files` are their paths in the folder.
 
     A depth map has the image's path, but for what follows the first dot and `depth` instead of `color` or `rgb`; or the
     time that is nearest, within `MAX_OFFSET_S`, where its name is a time in seconds (TUM).
-
-    Args:
-        folder: of the depth maps.
-        files: their paths in it.
-        times_us: of each image, microseconds.
     """
     by_key = {_key(file): file for file in files}
     found = {name: folder / by_key[_key(name)] for name in times_us if _key(name) in by_key}
-    stems = {file: _stem(file) for file in files}
-    if not found and all(map(is_number, stems.values())):
-        order = sorted(files, key=lambda file: float(stems[file]))
-        times = np.array([float(stems[file]) * 1e6 for file in order])
+    if not found and all(is_number(_stem(file)) for file in files):
+        order = sorted(files, key=lambda file: float(_stem(file)))
+        times = np.array([float(_stem(file)) * 1e6 for file in order])
         track = Track(times.astype(np.int64), np.zeros((len(order), 4, 4)), "")
         nearest = {name: track.nearest(time) for name, time in times_us.items()}
         found = {name: folder / order[row] for name, row in nearest.items() if row is not None}

@@ -136,10 +136,8 @@ def collect(
     pairs = pd.DataFrame(rows, columns=["file", *COUNTS, "state"])
     text = _description(description)
     if filled := pairs["filled"].sum():
-        text += (
-            f"{filled} of {pairs['asked'].sum()} queries were not localized and have the pose of their nearest "
-            "reference image.\n"
-        )
+        how = "were not localized and have the pose of their nearest reference image"
+        text += f"{filled} of {pairs['asked'].sum()} queries {how}.\n"
     path = Path(out) if out else folders[0] / "submission.zip"
     return Submission(path, text, poses, pd.concat(tables)[COLUMNS_OF_QUERIES], pairs)
 
@@ -150,8 +148,7 @@ def open_captures(
 ) -> Iterator[Callable[[str], Capture]]:
     """Yield a function that opens a scene's capture, with the kinds of devices and the links of the runs' manifests.
 
-    Args:
-        given: folders of captures that have moved since the runs; each must have the name of one of the `scenes`.
+    Captures that have moved since the runs are in the `given` folders, which have the names of scenes.
 
     Raises:
         ManifestError: a given folder has another name.

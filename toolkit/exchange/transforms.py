@@ -30,11 +30,7 @@ from toolkit.capture import parse_camera
 from toolkit.capture.images import is_file, read_header
 from toolkit.capture.tables import FARTHEST_M
 from toolkit.errors import CaptureError, ImageError
-from toolkit.exchange.drafts import (
-    IMAGE_SUFFIXES,
-    every_nth,
-    start,
-)
+from toolkit.exchange.drafts import IMAGE_SUFFIXES, every_nth, start
 from toolkit.exchange.import_report import ImportReport
 from toolkit.geometry import Floats
 
@@ -59,8 +55,7 @@ def import_transforms(
 
     Raises:
         CaptureError: a malformed file (names frame and key), or a session that exists already or has no usable image.
-        ManifestError: an unknown split, placing or axes, a unit that is not a positive length, or an invalid
-            `hold_out`.
+        ManifestError: as for `drafts.start`.
     """
     path = Path(path)
     options.setdefault("axes", "opengl")
@@ -80,10 +75,9 @@ def import_transforms(
         try:
             if own_split and frame.listed not in held | trained:
                 raise CaptureError("it is in none of train_filenames, val_filenames and test_filenames")
-            world_from_named = frame.world_from_named()
-            if undo_applied:
-                world_from_named = _undone(world_from_named, *applied)
-            draft.add_image(name, frame.camera(), world_from_named, f"given by {path.name}")
+            pose = frame.world_from_named()
+            pose = _undone(pose, *applied) if undo_applied else pose
+            draft.add_image(name, frame.camera(), pose, f"given by {path.name}")
         except (ImageError, CaptureError) as error:
             draft.add_image(name, str(error), None, "")
     draft.listed_in, draft.beside = path.name, True
@@ -98,9 +92,8 @@ def import_transforms(
         world = "that of the file's input" if undo_applied else "the file's, turned from that of its input"
         other = "" if undo_applied else ". For the input's, as of a COLMAP model beside it, give --undo-applied"
         draft.notes.append(f"applied_transform, applied_scale {scale:g}: the world is {world}{other}")
-    if own_split:
-        return draft.finish({name for name, frame in frames.items() if frame.listed in held})
-    return draft.finish(every_nth(sorted(frames), draft.hold_out))
+    of_file = {name for name, frame in frames.items() if frame.listed in held}
+    return draft.finish(of_file if own_split else every_nth(sorted(frames), draft.hold_out))
 
 
 def _read(path: Path) -> dict[str, Any]:

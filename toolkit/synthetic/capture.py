@@ -30,7 +30,10 @@ from toolkit.synthetic.textures import Image, Rng
 from toolkit.threads import release_memory
 
 if TYPE_CHECKING:
+    import pandas as pd
     import pycolmap
+
+    from toolkit.capture import Trajectory
 
 FORMAT = 3  # increase it when the same settings produce other bytes
 
@@ -136,6 +139,21 @@ class Tables:
             self.rigs.append((timestamp, rig_id, sensor_id, rig_from_body @ sensor.body_from_cam))
         return rig_id, invert(rig_from_body)
 
+    def write(
+        self, path: Path, trajectory: "Trajectory", odometry: "Trajectory | None", keyframes: "dict[str, pd.DataFrame]",
+        **scans: Any,
+    ) -> None:  # fmt: skip
+        """Write a session: a map with its trajectory; or queries with odometry, `keyframes`, and it as ground truth."""
+        from toolkit.capture import write_session
+
+        is_map = path.name.endswith("_map")
+        write_session(
+            path, self.sensors.values(), [row[1:] for row in sorted(self.rigs, key=lambda row: row[:3])] or None,
+            trajectory if is_map else odometry, sorted(self.images), depths=sorted(self.depths) or None,
+            subsessions=[*self.subsessions], keyframes=None if is_map else keyframes,
+            ground_truth=None if is_map else trajectory, **scans,
+        )  # fmt: skip
+
 
 def subsession_of(name: str, split: str, part: int, hours: int) -> tuple[str, int]:
     """Return a subsession's name and its start on the device's clock, microseconds."""
@@ -229,10 +247,7 @@ def _add_hard(sessions: Path, world: World, table: Tables, elsewhere: Scene) -> 
     """Add a recording of hard images to the phone's query session.
 
     The phone walks through the first room again, there and back: its images are those of the easy queries, changed as
-    `HARD` says, with their true poses. The last one is taken in another room, a few seconds later.
-
-    Args:
-        elsewhere: a painted room that is in no map.
+    `HARD` says, with their true poses. The last one is taken a few seconds later, in a painted room that is in no map.
     """
     import pycolmap
 
@@ -291,12 +306,11 @@ def _poses_between(table: Tables, world: World, name: str) -> list[tuple[int, st
 def _write_session(path: Path, world: World, table: Tables, rooms: list[Scene]) -> None:
     """Write the text files of a session, rows ordered by time. Query sessions get odometry instead of true poses.
 
-    Args:
-        rooms: all rooms, in which radio signals are scanned; empty: no scans.
+    Radio signals are scanned in all `rooms`, if any.
     """
     import pandas as pd
 
-    from toolkit.capture import Trajectory, write_session
+    from toolkit.capture import Trajectory
 
     name, _, split = path.name.rpartition("_")
     pictured = sorted(row[:2] for row in table.poses)
@@ -328,19 +342,7 @@ def _write_session(path: Path, world: World, table: Tables, rooms: list[Scene]) 
     pruned = frames[(np.arange(len(frames)) % 6 != 5) | hard]
     subsampled = pruned[(np.arange(len(pruned)) % 3 != 1) | hard[pruned.index]]
     keyframes = {"original": frames, "pruned": pruned, "pruned_subsampled": subsampled}
-    write_session(
-        path,
-        sensors=table.sensors.values(),
-        rigs=[row[1:] for row in sorted(table.rigs, key=lambda row: row[:3])] or None,
-        trajectory=trajectory if split == "map" else odometry,
-        images=sorted(table.images),
-        depths=sorted(table.depths) or None,
-        subsessions=list(table.subsessions),
-        keyframes=keyframes if split == "query" else None,
-        ground_truth=trajectory if split == "query" else None,
-        wifi=sorted(scanned.get("wifi", [])) or None,
-        bt=sorted(scanned.get("bt", [])) or None,
-    )
+    table.write(path, trajectory, odometry, keyframes, **{kind: sorted(rows) or None for kind, rows in scanned.items()})
 
 
 def render_capture(

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from toolkit.capture import Trajectory, write_session
+from toolkit.capture import Trajectory
 from toolkit.capture.images import default_workers
 from toolkit.errors import CaptureError
 from toolkit.files import write_folder
@@ -94,9 +94,11 @@ def arrange(path: str | Path, out: str | Path, scenes: tuple[str, ...] = SCENES,
     tables = {f"{name}_{split}": Tables() for name in _DEVICES for split in ("map", "query")}
     with write_folder(out) as folder, ThreadPoolExecutor(default_workers()) as pool:
         for index, scene in enumerate(scenes):
-            shots = []
-            for split, name, number, photograph in _shares(_along_the_path(_read_scene(Path(path), scene)), hard):
-                shots += list(_plan(tables[f"{name}_{split}"], split, name, index, number, photograph, hard, seed))
+            shots = list[Shot]()
+            for number, photograph in enumerate(_along_the_path(_read_scene(Path(path), scene))):
+                split = "query" if (number % 3 != 1 if hard else number % 5 in (1, 3)) else "map"
+                for name in _DEVICES:
+                    shots += _plan(tables[f"{name}_{split}"], split, name, index, number, photograph, hard, seed)
             # One photograph after the other, as each is decoded once for all devices.
             shots.sort(key=lambda shot: shot[0].path)
             list(pool.map(partial(_take, folder / "sessions", seed), shots))
@@ -131,14 +133,6 @@ def _along_the_path(photographs: list[Photograph]) -> list[Photograph]:
     centers = np.stack([one.world_from_cam[:3, 3] for one in photographs])
     axis = np.linalg.svd(centers - centers.mean(axis=0))[2][0]
     return [photographs[k] for k in np.argsort(centers @ axis * np.sign(axis[np.abs(axis).argmax()]))]
-
-
-def _shares(photographs: list[Photograph], hard: bool) -> Iterator[tuple[str, str, int, Photograph]]:
-    """Yield split, device and number of the frames; every device has all photographs."""
-    for number, photograph in enumerate(photographs):
-        query = number % 3 != 1 if hard else number % 5 in (1, 3)
-        for name in _DEVICES:
-            yield "query" if query else "map", name, number, photograph
 
 
 Shot = tuple[Photograph, str, Sensor, bool, bool, Floats, str]
@@ -269,16 +263,6 @@ def _write(path: Path, table: Tables) -> None:
     rows = sorted(table.poses, key=lambda row: row[:2])
     times, ids = [row[0] for row in rows], [row[1] for row in rows]
     trajectory = Trajectory.from_poses(np.array(times, np.int64), ids, np.stack([row[2] for row in rows]))
-    query = path.name.endswith("_query")
     frames = pd.DataFrame({"timestamp": times, "device_id": ids})
     lists = {"original": frames, "pruned": frames, "pruned_subsampled": frames[np.arange(len(frames)) % 5 != 4]}
-    write_session(
-        path,
-        sensors=table.sensors.values(),
-        rigs=[row[1:] for row in sorted(table.rigs, key=lambda row: row[:3])] or None,
-        trajectory=None if query else trajectory,
-        images=sorted(table.images),
-        subsessions=list(table.subsessions),
-        keyframes=lists if query else None,
-        ground_truth=trajectory if query else None,
-    )
+    table.write(path, trajectory, None, lists)

@@ -52,9 +52,7 @@ def odometry_of(rng: Rng, world_from_rig: Floats, drift: float, parts: float = 1
 
     The frame is upright to within 0.3 degrees. At `drift` 1, all lengths have a common error of 1 %, and each step has
     errors of another 1 % of its length and of 0.1 degrees (standard deviations; the errors of a step are per axis).
-
-    Args:
-        parts: number of poses that make up such a step.
+    Such a step is made up of `parts` poses.
     """
 
     def rotation(degrees: Floats) -> Floats:
@@ -162,8 +160,7 @@ def scans(
 ) -> Iterator[tuple[Any, ...]]:
     """Yield the rows of a recording in wifi.txt or bt.txt, depending on the kind of the emitters.
 
-    Args:
-        times, poses: the recording's frames, (N,) microseconds and (N, 4, 4); the path between two frames is straight.
+    Its frames have `times` (N,), microseconds, and poses (N, 4, 4); the path between two frames is straight.
     """
     wifi = bool(emitters[0].frequency_khz)
     period_us = round(1e6 * (WIFI_S if wifi else BLUETOOTH_S))

@@ -6,6 +6,7 @@ Each random generator is seeded by the seed and the name of the thing it draws, 
 import zlib
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -140,8 +141,7 @@ def _furnish(scene: Scene, rng: Rng, wall: int, along: float, room: float, kind:
     tall = scene.size[2]
     width = {
         "shelf": rng.uniform(0.9, 1.6), "cabinet": rng.uniform(0.8, 1.4), "posters": rng.uniform(0.6, 0.9),
-        "door": 1.0, "window": rng.uniform(1.1, 1.5), "board": rng.uniform(1.2, 1.8), "crates": 1.1,
-        "pillar": 0.4,
+        "door": 1.0, "window": rng.uniform(1.1, 1.5), "board": rng.uniform(1.2, 1.8), "crates": 1.1, "pillar": 0.4,
         "painting": rng.uniform(0.9, 1.5), "planter": rng.uniform(0.9, 1.5), "bench": rng.uniform(1.3, 1.8),
     }[kind]  # fmt: skip
     if width > room:
@@ -243,9 +243,8 @@ def _furnish_wall(scene: Scene, rng: Rng, wall: int, things: list[str]) -> None:
             scene.box(scene.at_wall(wall, at, 0.18), 2.98, (1.25, 0.18, 0.1), sill)
 
 
-def _build_sky(scene: Scene) -> None:
-    scene.plate((-150, -150, 40), (1, 0, 0), (0, 1, 0), 300, 300, tex.clouds, 4, lit=False)
-    scene.lamps = [scene.origin + np.array([9.0 + 2 * i, -14.0, 22.0]) for i in (-0.5, 0.5)]
+def _cells(height: float, width: float, colors: Any, stagger: str, **options: Any) -> Material:
+    return partial(tex.cells, size=(height, width), colors=colors, stagger=stagger, **options)
 
 
 def build_room(seed: int, index: int, look: int | None = None) -> Scene:
@@ -260,23 +259,21 @@ def build_room(seed: int, index: int, look: int | None = None) -> Scene:
     kind = list(KINDS.values())[(look + seed) % len(KINDS)]
     outdoor = bool(kind.get("outdoor"))
     w, d, h = rng.uniform([7.4, 6.0, 3.0], [8.8, 7.0, 3.4])
-    if outdoor:
-        w, d, h = w + 1.2, d + 1.2, 5.4
+    w, d, h = (w + 1.2, d + 1.2, 5.4) if outdoor else (w, d, h)
     origin = np.array([28.0 * index, 4.0 * (index % 3), 0.0])
     scene = Scene(origin, (w, d, h), outdoor)
     if kind["wall"] is None:
         paint = np.asarray(tex.random_color(rng, (0.08, 0.3), (0.7, 0.88)))
         wall: Material = partial(tex.plaster, color=paint, band=paint * rng.uniform(0.5, 0.75))
     else:
-        ch, cw, colors, stagger = kind["wall"]
-        wall = partial(tex.cells, size=(ch, cw), colors=colors, stagger=stagger)
+        wall = _cells(*kind["wall"])
     for k in range(4):
         _build_wall(scene, k, wall)
-    ch, cw, colors, stagger = kind["floor"]
-    floor = partial(tex.cells, size=(ch, cw), colors=colors, stagger=stagger, jitter=0.15, motifs=stagger == "none")
+    floor = _cells(*kind["floor"], jitter=0.15, motifs=kind["floor"][3] == "none")
     scene.plate((-w / 2, d / 2, 0), (1, 0, 0), (0, -1, 0), w, d, floor, 256)
     if outdoor:
-        _build_sky(scene)
+        scene.plate((-150, -150, 40), (1, 0, 0), (0, 1, 0), 300, 300, tex.clouds, 4, lit=False)  # the sky
+        scene.lamps = [scene.origin + np.array([9.0 + 2 * i, -14.0, 22.0]) for i in (-0.5, 0.5)]
     else:
         ceiling = partial(tex.cells, size=(0.6, 0.6), colors=[(215, 222, 225)], stagger="none", jitter=0.03)
         scene.plate((-w / 2, -d / 2, h), (1, 0, 0), (0, 1, 0), w, d, ceiling, 160)
@@ -296,18 +293,15 @@ def build_room(seed: int, index: int, look: int | None = None) -> Scene:
 def _furnish_middle(scene: Scene, rng: Rng) -> None:
     """Furnish the corners, the middle, and the space below the ceiling. Leave a ring free for the walks."""
     w, d, h = scene.size
-    for sx, sy in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+    for sx, sy in product((1, -1), repeat=2):
         x, y, yaw = sx * (w / 2 - 0.42), sy * (d / 2 - 0.42), rng.uniform(0, 6)
-        kind = rng.integers(3)
-        if kind == 0:
-            scene.box((x, y, yaw), 0, (0.42, 0.42, 0.9), tex.poster)
-            scene.box((x, y, yaw + 0.5), 0.9, (0.3, 0.3, 0.35), tex.books)
-        elif kind == 1:
-            scene.box((x, y, yaw), 0, (0.4, 0.4, 0.4), tex.crate)
-            scene.box((x, y, yaw + 0.3), 0.4, (0.36, 0.36, 0.8), tex.leaves)
-        else:
-            scene.box((x, y, yaw), 0, (0.5, 0.45, 0.5), tex.crate)
-            scene.box((x, y, yaw + 0.4), 0.5, (0.4, 0.35, 0.4), tex.drawers)
+        below, above, turn = (
+            (((0.42, 0.42, 0.9), tex.poster), ((0.3, 0.3, 0.35), tex.books), 0.5),
+            (((0.4, 0.4, 0.4), tex.crate), ((0.36, 0.36, 0.8), tex.leaves), 0.3),
+            (((0.5, 0.45, 0.5), tex.crate), ((0.4, 0.35, 0.4), tex.drawers), 0.4),
+        )[rng.integers(3)]
+        scene.box((x, y, yaw), 0, *below)
+        scene.box((x, y, yaw + turn), below[0][2], *above)
     yaw, tone = rng.uniform(-0.4, 0.4), partial(tex.wood, color=np.asarray(OAK[0]) * rng.uniform(0.6, 1.2))
     c, s = np.cos(yaw), np.sin(yaw)
     if not scene.outdoor and rng.random() < 0.7:  # a table

@@ -52,16 +52,13 @@ def _painted(color: Any, shade: Image) -> Image:
     return np.clip(_f(color) * (1 + shade[..., None]), 0, 255).astype(np.uint8)
 
 
-def _words(rng: Rng, count: int) -> str:
-    syllables = ["ka", "lo", "mi", "ra", "tu", "ze", "bor", "den", "fal", "gri", "hus", "win", "OX", "42", "7", "No."]
-    return " ".join("".join(rng.choice(syllables, rng.integers(1, 4))) for _ in range(count))
-
-
 def _write(rng: Rng, image: Image, x: float, y: float, height: float, color: Any, words: int = 2) -> None:
     """Write words whose capitals are about `height` pixels high, baseline at (x, y)."""
     font = int(rng.choice([cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX]))
     thick = max(1, round(height / 9))
-    cv2.putText(image, _words(rng, words), (int(x), int(y)), font, height / 22, color, thick, cv2.LINE_AA)
+    syllables = ["ka", "lo", "mi", "ra", "tu", "ze", "bor", "den", "fal", "gri", "hus", "win", "OX", "42", "7", "No."]
+    text = " ".join("".join(rng.choice(syllables, rng.integers(1, 4))) for _ in range(words))
+    cv2.putText(image, text, (int(x), int(y)), font, height / 22, color, thick, cv2.LINE_AA)
 
 
 def _spot(rng: Rng, image: Image) -> list[int]:
