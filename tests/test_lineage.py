@@ -12,7 +12,8 @@ import papermill
 import pytest
 
 from toolkit import notebook, pipeline
-from toolkit.capture import Trajectory
+from toolkit.capture import Capture
+from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.errors import ArtifactError, ManifestError
 from toolkit.evaluate import evaluate_scene
 from toolkit.exchange.export import export_colmap, export_pairs, export_poses
@@ -24,15 +25,19 @@ from toolkit.files import (
     changed_sources,
     file_fingerprint,
     link_or_copy,
+    map_record_path,
     older_files,
+    read_map_record,
     read_sidecar,
     require_current,
     why_older,
     write_sidecar,
 )
+from toolkit.localize import localize_image
 from toolkit.notebook import notebook_path
 from toolkit.report.comparison import compare_runs
 from toolkit.report.page import write_report
+from toolkit.results.pair import PairResults
 from toolkit.scene.inspection import InspectedPair
 from toolkit.scene.map import Map
 from toolkit.scene.run import Run
@@ -199,6 +204,8 @@ READERS = [
     (VECTORS, exported_pairs, "run the retrieve stage again"),
     (REFERENCES, exported_poses, "run the localize stage again"),
     (MAP, exported_poses, "run the localize stage again"),
+    (FEATURES, opened, "of other images or features: run the localize stage again"),
+    (FEATURES, inspected_again, "of other images or features: run the localize stage again"),
     (FEATURES, exported_map, "of other images or features: run the localize stage again"),
     (FEATURES, exported_matches, "of other images or features: run the localize stage again"),
     (TABLE, linked_report, "is of an older poses/"),
@@ -254,8 +261,9 @@ def linked(small_run: Path, tmp_path: Path) -> SceneFiles:
 @pytest.mark.slow
 @pytest.mark.parametrize(("what", "read", "said"), READERS, ids=[f"{r.__name__}-{what}" for what, r, _ in READERS])
 def test_no_reader_combines_an_artifact_with_an_older_one(
-    linked: SceneFiles, small_capture: Path, what: str, read: Callable[[SceneFiles, Path], str], said: str
-) -> None:
+    linked: SceneFiles, small_capture: Path, released_weights: None, what: str,
+    read: Callable[[SceneFiles, Path], str], said: str,
+) -> None:  # fmt: skip
     change(linked, what)
     try:
         text = read(linked, small_capture)
@@ -315,32 +323,67 @@ def test_a_run_with_other_settings_leaves_the_finished_one_as_it_is(linked: Scen
     assert "nearest" in taken.poses_csv("ios", "hl").read_text()
 
 
-METHODS: list[dict[str, Any]] = [
-    {"method": "pnp", "pnp": {"max_error_deg": 0.4}}, {"method": "nearest"},
-    {"method": "feed_forward", "predictor": "simulated"}, {"method": "hybrid", "predictor": "simulated"},
-]  # fmt: skip
+METHODS: dict[str, dict[str, Any]] = {
+    "pnp": {"method": "pnp", "pnp": {"max_error_deg": 0.4}},
+    "nearest": {"method": "nearest"},
+    "feed_forward": {"method": "feed_forward", "predictor": "simulated"},
+    "hybrid": {"method": "hybrid", "predictor": "simulated"},
+    "aliked": {"method": "pnp", "features": {"kinds": ["aliked"]}, "matcher": {"name": "mutual"}},
+}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS, ids=[" ".join(map(str, method.values())) for method in METHODS])
-def test_a_notebook_by_hand_gives_the_poses_of_a_run(
-    linked: SceneFiles, small_capture: Path, tmp_path: Path, method: dict[str, Any]
-) -> None:
-    manifest = linked.run.parent / f"{linked.run.name}.yaml"
-    pair = f"captures: ['{small_capture}']\noutput_root: .\npairs: [[ios, spot]]\n"
-    manifest.write_text(f"{pair}localize: {json.dumps(method)}\n")
-    pipeline.run(manifest, only="localize", say=quiet, in_place=True)
-    nested = {name: value for name, value in method.items() if isinstance(value, dict)}
-    parameters = {name: value for name, value in method.items() if name not in nested} | {"settings": nested}
-    parameters |= {"map_device": "ios", "query_device": "spot"}
-    folders = {name: str(tmp_path / name) for name in ("out_dir", "features_dir", "map_dir")}
-    folders |= {"sessions_root": str(small_capture / "sessions"), "retrieval_dir": str(linked.retrieval_dir)}
+@pytest.mark.parametrize("name", METHODS)
+def test_every_door_gives_the_same_poses(
+    linked: SceneFiles, small_capture: Path, tmp_path: Path, released_weights: None,
+    request: pytest.FixtureRequest, name: str,
+) -> None:  # fmt: skip
+    """A run, the notebook by hand, one image at a time and inspection, with a unit that the import did not know."""
+    method = METHODS[name]
+    if name == "aliked":
+        request.getfixturevalue("learned_weights")
+    manifest, devices = linked.run.parent / f"{linked.run.name}.yaml", ("ios", "ios")
+    capture = Path(shutil.copytree(small_capture, tmp_path / "copy" / small_capture.name))
+    for record in capture.glob("sessions/*"):
+        (record / IMPORT_RECORD).parent.mkdir(exist_ok=True)
+        (record / IMPORT_RECORD).write_text('{"unit": null}')
+    content = f"captures: ['{capture}']\noutput_root: .\npairs: [[ios, ios]]\n"
+    manifest.write_text(f"{content}localize: {json.dumps(method)}\n")
+    shutil.rmtree(linked.poses_dir)  # the other pairs would be of an older map
+    pipeline.run(manifest, only="embed,retrieve,localize", say=quiet, in_place=True)
+    path, run = linked.poses_txt(*devices), Run.open(linked.run)
+    results, unit = PairResults.open(path), read_map_record(map_record_path(linked.poses_dir, "SMALL", "ios"))["unit"]
+    assert len(results) == 2
+    assert unit is None
+    # by hand
+    nested = {key: value for key, value in method.items() if isinstance(value, dict)}
+    parameters = {key: value for key, value in method.items() if key not in nested} | {"settings": nested}
+    parameters |= dict(zip(("map_device", "query_device"), devices, strict=True))
+    folders = {key: str(tmp_path / key) for key in ("out_dir", "features_dir", "map_dir")}
+    folders |= {"sessions_root": str(capture / "sessions"), "retrieval_dir": str(linked.retrieval_dir)}
     papermill.execute_notebook(notebook_path("localize"), None, parameters | folders, progress_bar=False)
-    path = linked.poses_txt("ios", "spot")
-    assert len(Trajectory.read(path)) == 2
     assert (tmp_path / "out_dir" / path.name).read_bytes() == path.read_bytes()
     by_run, by_hand = (pd.read_csv(one / f"{path.stem}.csv") for one in (linked.poses_dir, tmp_path / "out_dir"))
     pd.testing.assert_frame_equal(by_run.drop(columns="seconds"), by_hand.drop(columns="seconds"))
+    assert read_map_record(map_record_path(tmp_path / "out_dir", "SMALL", "ios"))["unit"] == unit
+    # one image, and inspection
+    place, session = run.map("ios"), Capture.open(capture)["ios_query"]
+    assert place.settings.unit == unit
+    inspected = InspectedPair(*devices, linked.poses_dir)
+    for number, rows in enumerate(session.rows_of_keyframes(results.table)):
+        one, (row,) = results[number], rows.tolist()
+        if "predictor" in method:  # it predicts images of the capture only
+            found = place.locate(place.query_of_session(session, rows))
+        else:
+            found = localize_image(place, session.image_path(row), session.camera(session.images["sensor_id"][row]))
+        shown = inspected.look(number)
+        assert shown.result.status_text == found.status_text == one.status_text
+        assert shown.unit == results.unit
+        for other in (found, shown.result, shown.result.what_if().after.result):
+            if one.world_from_rig is None:
+                assert other.world_from_rig is None
+            else:
+                np.testing.assert_allclose(other.world_from_rig, one.world_from_rig, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -1,3 +1,4 @@
+import json
 import os
 import shutil
 from pathlib import Path
@@ -9,6 +10,7 @@ from PIL import Image
 
 from toolkit.capture import Trajectory, write_session
 from toolkit.capture.check import check_capture
+from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.errors import CaptureError
 
 CAPTURES = Path(__file__).parents[2].parent / "shared" / "data" / "captures"
@@ -313,6 +315,20 @@ def test_warnings_alone_leave_it_ok(capture: Path) -> None:
 def test_a_map_without_trajectories_is_an_error(capture: Path) -> None:
     (capture / "sessions" / "hl_map" / "trajectories.txt").unlink()
     assert found(capture) == ["hl_map/trajectories.txt: error: file not found: images of a map session need poses"]
+
+
+@pytest.mark.parametrize(
+    ("record", "warned"),
+    [({"unit": "m"}, True), ({"unit": "m", "meters": "--unit 1"}, False), ({"unit": None}, False), ({}, False)],
+)
+def test_meters_of_an_import_that_does_not_say_from_where_are_noted(
+    capture: Path, record: dict[str, str | None], warned: bool
+) -> None:
+    path = capture / "sessions" / "hl_map" / IMPORT_RECORD
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps(record))
+    expected = "hl_map/proc/import.json: warning: says meters, not from where; earlier versions did of any unit"
+    assert found(capture) == [f"{expected}: import again, or set `unit`"] * warned
 
 
 def test_a_strange_session_name_is_noted(capture: Path) -> None:

@@ -160,6 +160,10 @@ class _SessionCheck:
                 self._add(file, line, message)
         if session.split == "map" and session.trajectory is None and len(session.images):
             self._add("trajectories.txt", 0, "file not found: images of a map session need poses")
+        record = read_json(session.path / IMPORT_RECORD)
+        if session.split == "map" and record.get("unit") == "m" and "meters" not in record:
+            message = "says meters, not from where; earlier versions did of any unit: import again, or set `unit`"
+            self._add(IMPORT_RECORD, 0, message, WARNING)
         if session.split == "query" and ASKED not in session.keyframe_files:
             lists = ", ".join(session.keyframe_files) or "none"
             message = f"no such list, the default for queries; found: {lists}. Set `queries` in the manifest, or add it"
