@@ -21,7 +21,7 @@ NOTEBOOKS := $(addprefix tests/,figures report results runs viewer $(addsuffix .
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo run test test-kernels test-numbers test-faults test-notebooks test-slow test-browser test-rest browser-setup docs docs-setup docs-images docs-view lab lint bench clean test-gpu bench-gpu
+.PHONY: help demo run test test-kernels test-numbers test-faults test-notebooks test-slow test-browser test-rest browser-setup docs docs-setup docs-images docs-view lab lint bench bench-paper clean test-gpu bench-gpu
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1|/' | column -t -s '|'
@@ -105,6 +105,10 @@ bench-gpu: $(INSTALLED)  ## run the benchmarks that need a GPU
 	$(BIN)/python -m benchmarks embed --device cuda
 	$(BIN)/python -m benchmarks vggt --device cuda
 	$(BIN)/python -m benchmarks matching --device cuda
+
+# PHOTOGRAPHS: the folder Benchmarking_Camera_Calibration_2008 of openMVG's SfM_quality_evaluation.
+bench-paper: $(INSTALLED)  ## measure the README's rows of real photographs: make bench-paper PHOTOGRAPHS=folder
+	$(BIN)/python -m benchmarks paper "$(PHOTOGRAPHS)"
 
 bench: $(INSTALLED)  ## run every script in benchmarks/; each has --help
 	$(BIN)/python -m benchmarks all

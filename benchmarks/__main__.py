@@ -7,7 +7,7 @@ from pathlib import Path
 
 NAMES = (
     "capture", "embed", "search", "index", "cluster", "matching", "vggt", "alignment", "localize", "latency",
-    "confidence", "scale",
+    "confidence", "scale", "paper",
 )  # fmt: skip
 SCRIPTS = {name: Path(__file__).with_name(f"{name}.py") for name in NAMES}
 

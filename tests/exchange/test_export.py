@@ -144,7 +144,7 @@ def test_nothing_is_overwritten_and_what_is_missing_is_named(
         export_colmap(run.run, run.scene, "hl", model, small_capture)
     with pytest.raises(ManifestError, match="--capture PATH/SMALL"):
         export_colmap(run.run, run.scene, "hl", tmp_path / "model")
-    with pytest.raises(ArtifactError, match=r"toolkit run MANIFEST --only localize"):
+    with pytest.raises(ArtifactError, match=r"run MANIFEST --only localize"):
         export_colmap(run.run, run.scene, "ios", tmp_path / "model", small_capture)
     changed = Path(shutil.copytree(small_capture, tmp_path / small_capture.name))
     images = changed / "sessions" / "hl_map" / "images.txt"
