@@ -1406,7 +1406,7 @@ def test_errors_without_a_unit_are_relative_to_the_depth(capture: Path, run: Sce
     )
     assert found.unit == "L"
     assert found.recall["recall@(1deg,0.1L)"].item() == 1.0
-    assert found.recall["median_translation_m"].item() < 0.05
+    assert found.recall["median_translation_L"].item() < 0.05
 
 
 def _times(poses: np.ndarray, factor: float) -> np.ndarray:

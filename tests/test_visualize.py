@@ -61,7 +61,7 @@ def test_the_worst_come_first_by_error_and_pictures_show_their_own_inliers(small
     assert worst == [0.3, 0.2, 0.1, 0.0]
     assert drawn["worst"][0].reason == "ok, 2 inliers"
     np.testing.assert_array_equal(drawn["worst"][0].details.cameras[0].pixels, queries[1].correspondences.pixels)
-    assert [query.cameras[0].num_inliers for query in drawn["samples"]] == [2, 1, 1]
+    assert [query.cameras[0].num_agreeing for query in drawn["samples"]] == [2, 1, 1]
     assert sorted(drawn["recorded"][0]) == [1, 2]
     np.testing.assert_allclose(drawn["recorded"][0][2].cameras[0].points, queries[2].correspondences.points)
     assert all((tmp_path / "out").joinpath(path).is_file() for path in table["still"])
