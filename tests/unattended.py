@@ -10,6 +10,7 @@ and, of one that ended well, the number of file operations of each stage.
 import json
 import os
 import select
+import signal
 import sys
 import time
 from collections import Counter
@@ -84,6 +85,9 @@ def run_in_child(manifest: Path, asked: dict[str, Any], tell: int, answer: int) 
     log = os.open(manifest.with_suffix(".log"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(log, 1)
     os.dup2(log, 2)
+    import pycolmap  # noqa: F401 - installs a handler of SIGTERM that may wait for memory forever, as it prints a trace
+
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     events = Events(manifest.parent / manifest.stem, asked.get("stage"), asked.get("event", 0), tell)
     pipeline.execute = lambda *arguments: execute_cells(events, *arguments)
     pipeline.run(manifest)
