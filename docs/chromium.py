@@ -171,7 +171,7 @@ def _wait_for(url: str, server: "subprocess.Popen[bytes]", log: Path, seconds: f
 def copy_notebook(stage: str, run: Path, sessions_root: Path, folder: Path) -> str:
     """Copy a stage's notebook to a folder, with parameters that name the files of a run; return its name.
 
-    Its results are a copy of the run's, beside it: a notebook may not write into a run.
+    Its results and caches are copies of the run's, beside it: a notebook may not write into a run.
     """
     import nbformat
 
@@ -182,6 +182,8 @@ def copy_notebook(stage: str, run: Path, sessions_root: Path, folder: Path) -> s
     results = shutil.copytree(files.of_stage(stage), folder / "results")
     places = {**files.folders(stage), "sessions_root": sessions_root, "out_dir": results}
     parameters = notebook_parameters(source)
+    for name in {"features_dir", "map_dir"} & {*parameters}:
+        places[name] = shutil.copytree(places[name], folder / name)
     parameters |= {name: str(path) for name, path in places.items() if name in parameters}
     content = nbformat.read(source, as_version=4)
     cell = next(cell for cell in content.cells if "parameters" in cell.metadata.get("tags", []))

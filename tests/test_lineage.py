@@ -209,7 +209,7 @@ READERS = [
     (FEATURES, exported_map, "of other images or features: run the localize stage again"),
     (FEATURES, exported_matches, "of other images or features: run the localize stage again"),
     (TABLE, linked_report, "is of an older poses/"),
-    (RECORD, linked_report, "Write it again: python -m toolkit report"),
+    (RECORD, linked_report, "Write it again: "),
 ]
 
 

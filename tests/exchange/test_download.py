@@ -446,7 +446,7 @@ def test_a_download_that_is_killed_goes_on(hub: FakeHub, manifest: Path, tmp_pat
     before = fetched()
     assert 1_000_000 <= before < 28_000_000
     assert is_unfinished(manifest.parent / "captures/PLACE")
-    with pytest.raises(ManifestError, match=r"toolkit download .*place\.yaml"):
+    with pytest.raises(ManifestError, match=r" download .*place\.yaml"):
         pipeline.run(manifest)
     hub.healthy()
     download(manifest)
