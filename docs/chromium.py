@@ -183,7 +183,9 @@ def copy_notebook(stage: str, run: Path, sessions_root: Path, folder: Path) -> s
     places = {**files.folders(stage), "sessions_root": sessions_root, "out_dir": results}
     parameters = notebook_parameters(source)
     for name in {"features_dir", "map_dir"} & {*parameters}:
-        places[name] = shutil.copytree(places[name], folder / name)
+        if places[name].is_dir():
+            shutil.copytree(places[name], folder / name)
+        places[name] = folder / name
     parameters |= {name: str(path) for name, path in places.items() if name in parameters}
     content = nbformat.read(source, as_version=4)
     cell = next(cell for cell in content.cells if "parameters" in cell.metadata.get("tags", []))
