@@ -14,7 +14,7 @@ import pytest
 from toolkit import notebook, pipeline
 from toolkit.capture import Capture
 from toolkit.capture.folder import IMPORT_RECORD
-from toolkit.errors import ArtifactError, ManifestError
+from toolkit.errors import COMMAND, ArtifactError, ManifestError
 from toolkit.evaluate import evaluate_scene
 from toolkit.exchange.export import export_colmap, export_pairs, export_poses
 from toolkit.exchange.hloc import export_matches
@@ -209,7 +209,7 @@ READERS = [
     (FEATURES, exported_map, "of other images or features: run the localize stage again"),
     (FEATURES, exported_matches, "of other images or features: run the localize stage again"),
     (TABLE, linked_report, "is of an older poses/"),
-    (RECORD, linked_report, "Write it again: "),
+    (RECORD, linked_report, f"Write it again: {COMMAND} report"),
 ]
 
 

@@ -25,7 +25,7 @@ from filelock import FileLock
 from tests.fake_hub import FakeHub, serving, use_hub
 from toolkit import pipeline
 from toolkit.capture import Capture
-from toolkit.errors import CaptureError, DownloadError, ManifestError, sentence
+from toolkit.errors import COMMAND, CaptureError, DownloadError, ManifestError, sentence
 from toolkit.exchange import archives
 from toolkit.exchange import download as module
 from toolkit.exchange.archives import arrange, unpack
@@ -446,7 +446,7 @@ def test_a_download_that_is_killed_goes_on(hub: FakeHub, manifest: Path, tmp_pat
     before = fetched()
     assert 1_000_000 <= before < 28_000_000
     assert is_unfinished(manifest.parent / "captures/PLACE")
-    with pytest.raises(ManifestError, match=r" download .*place\.yaml"):
+    with pytest.raises(ManifestError, match=rf"{COMMAND} download .*place\.yaml"):
         pipeline.run(manifest)
     hub.healthy()
     download(manifest)

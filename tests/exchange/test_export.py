@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from tests.rendered import copy_shared
 from toolkit.__main__ import app
 from toolkit.capture import Capture, Session
-from toolkit.errors import ArtifactError, ManifestError
+from toolkit.errors import COMMAND, ArtifactError, ManifestError
 from toolkit.exchange.export import colmap_model, export_colmap, export_pairs, export_poses, export_table
 from toolkit.exchange.interchange import import_colmap, import_images
 from toolkit.features.stores import FeatureStore, extract_session
@@ -144,7 +144,7 @@ def test_nothing_is_overwritten_and_what_is_missing_is_named(
         export_colmap(run.run, run.scene, "hl", model, small_capture)
     with pytest.raises(ManifestError, match="--capture PATH/SMALL"):
         export_colmap(run.run, run.scene, "hl", tmp_path / "model")
-    with pytest.raises(ArtifactError, match=r"run MANIFEST --only localize"):
+    with pytest.raises(ArtifactError, match=f"{COMMAND} run MANIFEST --only localize"):
         export_colmap(run.run, run.scene, "ios", tmp_path / "model", small_capture)
     changed = Path(shutil.copytree(small_capture, tmp_path / small_capture.name))
     images = changed / "sessions" / "hl_map" / "images.txt"

@@ -223,9 +223,8 @@ class PnpLocalizer(Localizer):
             return estimate  # each confirms the other
         rig_from_world = geometry.invert(prior.world_from_rig)
         points = [self.map.observations(int(image))[1] for image in prior.images]
-        images = self.matcher.covisible(np.unique(np.concatenate([np.zeros(0, np.int64), *points])))
-        vicinity = self.matcher.vicinity(query, rig_from_world, images, prior.radius_deg)
-        near = vicinity.guided(rig_from_world, prior.radius_deg, MAX_GUIDED_MATCHES)
+        seen = np.concatenate([np.zeros(0, np.int64), *points])
+        near = self._guided_around(query, rig_from_world, seen, prior.radius_deg)
         start = self._ransac(query, near, self.settings.ransac_max_error_deg) if len(near) else None
         if start is None:
             return estimate
@@ -334,9 +333,8 @@ class PnpLocalizer(Localizer):
     def _add_neighbor(self, query: RigQuery, matches: Matches, hypotheses: list[_Hypothesis]) -> None:
         """Add the pose that fits most closely around the best so far; even one 0.1 m away may be the better of two."""
         pose = _best_first(hypotheses)[0].rig_from_world
-        covisible = self.matcher.covisible(np.unique(matches.point[self._inliers(query, pose, matches)]))
-        vicinity = self.matcher.vicinity(query, pose, covisible, WIDE_RADIUS_DEG)
-        around = vicinity.guided(pose, WIDE_RADIUS_DEG, MAX_GUIDED_MATCHES)
+        seen = matches.point[self._inliers(query, pose, matches)]
+        around = self._guided_around(query, pose, seen, WIDE_RADIUS_DEG)
         start = self._ransac(query, around, CLOSE * self.settings.max_error_deg)
         self._add(query, matches, hypotheses, start, 0.2)
 
@@ -348,6 +346,12 @@ class PnpLocalizer(Localizer):
             return
         if not any(agree(one.world_from_rig, geometry.invert(start), share) for one in hypotheses):
             hypotheses.append(self._improve(query, start, matches))
+
+    def _guided_around(self, query: RigQuery, rig_from_world: Floats, points: Ints, radius_deg: float) -> Matches:
+        """Return the guided matches at a pose with the images that observe some of the given points."""
+        images = self.matcher.covisible(np.unique(points))
+        vicinity = self.matcher.vicinity(query, rig_from_world, images, radius_deg)
+        return vicinity.guided(rig_from_world, radius_deg, MAX_GUIDED_MATCHES)
 
     def _independent(self, inliers: Matches) -> int:
         """Return the number of independent inliers: those that share a point or a keypoint count once."""
@@ -375,7 +379,7 @@ class PnpLocalizer(Localizer):
             if len(guided) < min_matches:
                 break
             refined = query.refine(pose, guided, self.map.points)
-            guided = guided[query.errors_deg(refined, guided, self.map.points) < settings.max_error_deg]
+            guided = guided[self._errors(query, refined, guided) < settings.max_error_deg]
             if len(guided) < min_matches:
                 break
             pose, inliers = query.refine(refined, guided, self.map.points, close=True), guided
@@ -397,7 +401,7 @@ class PnpLocalizer(Localizer):
             return self._failed(reason, matches, independent)
         errors, rivals = query.errors_px(rig_from_world, guided, self.map.points), self._rivals(hypotheses)
         unguided = matches[~np.isin(matches.rows(), guided.rows())]
-        unguided_agree = query.errors_deg(rig_from_world, unguided, self.map.points) < settings.max_error_deg
+        unguided_agree = self._errors(query, rig_from_world, unguided) < settings.max_error_deg
         all_matches = Matches.pooled([guided, unguided])
         agreeing = np.concatenate([np.ones(len(guided), bool), unguided_agree])
         images = np.unique(np.concatenate([retrieved.images for retrieved in references]))
