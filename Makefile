@@ -110,7 +110,7 @@ bench-gpu: $(INSTALLED)  ## run the benchmarks that need a GPU
 bench-paper: $(INSTALLED)  ## measure the README's rows of real photographs: make bench-paper PHOTOGRAPHS=folder
 	$(BIN)/python -m benchmarks paper "$(PHOTOGRAPHS)"
 
-bench: $(INSTALLED)  ## run every script in benchmarks/; each has --help
+bench: $(INSTALLED)  ## run the scripts in benchmarks/ that need no folder; each has --help
 	$(BIN)/python -m benchmarks all
 
 clean:  ## remove caches and the environment; keep runs/ and data/

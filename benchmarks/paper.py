@@ -11,7 +11,6 @@ import json
 import resource
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,9 @@ import pandas as pd
 
 from benchmarks.common import add_out, check_out, markdown_table, write_out
 from toolkit.figures.evaluation import wilson_interval
-from toolkit.results.metrics import is_below
+from toolkit.results.metrics import is_below, recall
+from toolkit.synthetic.photographs import THRESHOLDS
 
-THRESHOLDS = ((1.0, 0.1), (2.0, 0.25), (5.0, 0.5))
 CAPTURES = {
     "STRECHA": ["strecha"],
     "STRECHA_HARD": ["strecha-hard"],
@@ -52,41 +51,43 @@ def measured(folder: Path, name: str, photographs: Path, features: str) -> dict[
     kind, *options = CAPTURES[name]
     if not (folder / name).exists():
         visloc(folder, "import", "dataset", kind, str(photographs.resolve()), name, *options)
-    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     visloc(folder, "run", name, "--name", f"{name}-{features}", "--force", "--set", f"localize.features={features}")
-    seconds, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
-    (table,) = (folder / "runs" / f"{name}-{features}").glob("*/evaluation/errors.csv")
-    errors = pd.read_csv(table)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    run = folder / "runs" / f"{name}-{features}"
+    record = json.loads((run / "run.json").read_text(encoding="utf-8"))
+    errors = pd.read_csv(run / name / "evaluation" / "errors.csv")
     rotation, position = errors["rotation_error_deg"].to_numpy(), errors["translation_error_m"].to_numpy()
     ok = (errors["status"] == "ok").to_numpy()
     return {
         "capture": name,
         "queries": len(errors),
-        "recall": [float(is_below(rotation, position, threshold).mean()) for threshold in THRESHOLDS],
+        "recall": recall(rotation, position, THRESHOLDS).tolist(),
         "ok": int(ok.sum()),
         "ok_wrong": int((ok & ~is_below(rotation, position, THRESHOLDS[-1])).sum()),
         "median_deg": float(np.median(rotation)),
         "median_cm": float(100 * np.median(position)),
-        "seconds": seconds,
+        "seconds": record["total_seconds"],
         "cpu_seconds": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
-        "largest_mb": after.ru_maxrss / 1024,
+        "peak_memory_mb": record["peak_memory_mb"],
+        "run": {key: record[key] for key in ("created", "machine", "versions", "commit")},
     }
 
 
 def row(numbers: dict[str, Any]) -> list[str]:
     """Return a row of the table."""
-    recall = []
+    recalls = []
     for share in numbers["recall"]:
         low, high = wilson_interval(share, numbers["queries"])
-        recall.append(f"{100 * share:.1f} ({100 * low:.1f} to {100 * high:.1f})")
+        recalls.append(f"{100 * share:.1f} ({100 * low:.1f} to {100 * high:.1f})")
     return [
         numbers["capture"],
         str(numbers["queries"]),
-        *recall,
+        *recalls,
         f"{numbers['ok']}, {numbers['ok_wrong']} wrong",
         f"{numbers['median_deg']:.3f} deg, {numbers['median_cm']:.2f} cm",
         f"{numbers['seconds']:.0f} s, {numbers['cpu_seconds']:.0f} CPU s",
-        f"{numbers['largest_mb'] / 1000:.1f} GB",
+        f"{numbers['peak_memory_mb'] / 1000:.1f} GB",
     ]
 
 
@@ -101,16 +102,14 @@ def main() -> int:
     check_out(parser, options.out)
     options.folder.mkdir(parents=True, exist_ok=True)
     all_numbers = [measured(options.folder, name, options.photographs, options.features) for name in options.captures]
-    run = options.folder / "runs" / f"{options.captures[-1]}-{options.features}"
-    record = json.loads((run / "run.json").read_text(encoding="utf-8"))
     recalls = [f"recall at ({degrees:g} deg, {meters:g} m), %" for degrees, meters in THRESHOLDS]
-    header = ["capture", "queries", *recalls, "ok", "median error", "time with pictures", "largest process"]
+    header = ["capture", "queries", *recalls, "ok", "median error", "time with pictures", "peak memory"]
     blank = [[f"{name}: `visloc {command}`", *[""] * (len(header) - 1)] for name, command in ABSENT.items()]
-    machine = {name: record[name] for name in ("created", "machine", "versions", "commit")}
-    on = f"{machine['machine']['cpu']}, {machine['machine']['cores']} cores, GPU: {machine['machine']['gpu']}"
-    text = f"{markdown_table(header, [*map(row, all_numbers), *blank])}\n\n{on}; commit {machine['commit']}\n"
+    run = all_numbers[-1]["run"]
+    on = "{cpu}, {cores} cores, GPU: {gpu}".format(**run["machine"])
+    text = f"{markdown_table(header, [*map(row, all_numbers), *blank])}\n\n{on}; commit {run['commit']}\n"
     print(text)
-    write_out(options.out, text, {"run": machine, "captures": all_numbers})
+    write_out(options.out, text, {"captures": all_numbers})
     return 0
 
 
