@@ -184,6 +184,18 @@ def test_a_wrong_focal_length_of_the_map_is_named(
     assert found == pytest.approx(factor, rel=0.03 if noise_deg == 0 else 0.05)
 
 
+def test_what_errors_of_slam_imitate_is_not_blamed_on_the_camera(small_capture: Path, small_features: Path) -> None:
+    """KinectFusion's poses of KITCHEN ask for 2 % of the focal length; of 25 images, 2 draws in 40 were blamed."""
+    for seed in (15, 16, 17):
+        survey = survey_of(small_capture, small_features, "spot", noisy(0.5, 0.01, seed))
+        change = np.array([-0.025, 0, 0, 0])
+        pairs = [
+            pair._replace(rays_i=_changed(pair.rays_i, change), rays_j=_changed(pair.rays_j, change))
+            for pair in survey.sample
+        ]
+        assert not SurveyedPairs(pairs, survey.images.world_from_cams).misfit(survey.images.cameras)
+
+
 def test_a_focal_length_one_percent_off_is_not_worth_a_word(small_capture: Path, small_features: Path) -> None:
     survey = survey_of(small_capture, small_features, "spot", np.array)
     change = np.array([0.01, 0, 0, 0])

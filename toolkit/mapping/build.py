@@ -42,7 +42,7 @@ RATIO = 0.9  # threshold of Lowe's ratio test among the candidates along the epi
 MAX_REFINEMENTS = 3  # rounds of bundle adjustment
 MIN_NOISE_PX = 1.0  # noise of the direction to points of the map, pixels, from which poses are refined
 NOISE_LIMIT = 4.0  # limits of a map whose poses are refined, in multiples of the noise of the direction to its points
-_MAP_FORMAT = 7  # increase when the same settings give another file, so that existing maps are built again
+_MAP_FORMAT = 8  # increase when the same settings give another file, so that existing maps are built again
 
 
 def select_pairs(

@@ -28,10 +28,11 @@ POSITION_GRID = (0.0, *np.geomspace(0.001, 0.4, 18))  # map lengths
 MIN_GAIN = 5.0  # of the logarithm of the likelihood; without noise, twice the gain is distributed as chi-squared
 SCAN = (-0.7, -0.5, -0.3, -0.15, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0, 8.0)  # changes of the focal length to start from
 MIN_CHANGE = 0.03  # smallest change of intrinsics that is worth a word: of 1 %, poses feel nothing
-SIGNIFICANCE = 1e-5  # largest probability that noise alone asks for the change
+IMITATED = 0.02  # change that systematic errors of SLAM poses imitate: KinectFusion's ask for 2 % of the focal length
+SIGNIFICANCE = 1e-5  # largest probability that noise alone asks for what is beyond the imitated change
 MIN_ANGLE = 5e-4  # radians; with smaller errors, principal points and distortions are right
 STEP = 1e-4
-MAX_REST_FOCAL, MAX_REST = 0.9, 0.5  # share of the errors that may be left: noise of poses imitates the other two
+MAX_REST_FOCAL, MAX_REST = 0.8, 0.5  # share of the errors that may be left: noise of poses imitates the other two
 
 
 class VerifiedPair(NamedTuple):
@@ -180,24 +181,25 @@ class SurveyedPairs:
         stated = float(self.medians().mean())
         starts = [np.array([factor, 0, 0, 0]) for factor in SCAN]
         nearest = min(starts, key=lambda start: float(self.medians(start).mean()))
-        fits = [self._fit([0], nearest)]
-        if stated > MIN_ANGLE:
-            fits += [self._fit([1, 2], np.zeros(4)), self._fit([3], np.zeros(4))]
         corner = float(np.median([np.hypot(one.width, one.height) / 2 / one.mean_focal_length() for one in cameras]))
+        fits = [self._fit([0], nearest, corner)]
+        if stated > MIN_ANGLE:
+            fits += [self._fit([1, 2], np.zeros(4), corner), self._fit([3], np.zeros(4), corner)]
         right = [
             fit
             for fit in fits
-            if np.linalg.norm(fit.change * (1, 1, 1, corner**2)) >= MIN_CHANGE
+            if fit.size >= MIN_CHANGE
             and fit.by_chance < SIGNIFICANCE
             and fit.errors < stated * (MAX_REST_FOCAL if fit.change[0] else MAX_REST)
         ]
         return _text(min(right, key=lambda fit: fit.errors).change, cameras, corner) if right else ""
 
-    def _fit(self, columns: list[int], start: Floats) -> "_Fit":
+    def _fit(self, columns: list[int], start: Floats, corner: float) -> "_Fit":
         """Fit some of the changes by Gauss-Newton with Cauchy weights; each pair counts alike.
 
         The significance is from the scatter of the pairs' gradients, as errors within a pair are not independent, and
-        those of pairs that share an image neither (Aronow, Samii and Assenova, Political Analysis 2015).
+        those of pairs that share an image neither (Aronow, Samii and Assenova, Political Analysis 2015). `corner` is
+        the distance of an image corner from the center, in focal lengths.
         """
         change = start.astype(np.float64)
         steps = STEP * np.eye(4)[columns]
@@ -214,14 +216,16 @@ class SurveyedPairs:
             if np.abs(step).max() < STEP:
                 break
         inverse = np.linalg.pinv(information)
+        size = float(np.linalg.norm(change * (1, 1, 1, corner**2)))
+        beyond = change[columns] * max(0.0, 1 - IMITATED / max(size, IMITATED))
         products = [gradients.T @ gradients, gradients.T @ self._share_image @ gradients]
         freedom = max(self._images - len(columns) - 1, 1)
         by_chance = []
         for product in products:
             covariance = inverse @ product @ inverse * self._images / freedom
-            squares = float(change[columns] @ np.linalg.pinv(covariance, hermitian=True) @ change[columns])
+            squares = float(beyond @ np.linalg.pinv(covariance, hermitian=True) @ beyond)
             by_chance.append(float(fdtrc(len(columns), freedom, max(squares, 0.0) / len(columns))))
-        return _Fit(change, max(by_chance), float(self.medians(change).mean()))
+        return _Fit(change, size, max(by_chance), float(self.medians(change).mean()))
 
 
 def _robust(jacobian: Floats, errors: Floats) -> tuple[float, Floats]:
@@ -234,6 +238,7 @@ class _Fit(NamedTuple):
     """A change of intrinsics that minimizes the angles of all pairs."""
 
     change: Floats  # (4,), see `_changed`
+    size: float  # of the change, in focal lengths; of a distortion at the corners of the images
     by_chance: float  # probability that noise alone asks for such a change
     errors: float  # mean over the pairs of their median angle, radians
 
