@@ -37,9 +37,7 @@ class ToolkitError(Exception):
     def at(cls, place: object, found: str = "", expected: str = "", do: str = "") -> Self:
         """Return the error `<place>: found <found>, expected <expected>. <do>`; empty parts are left out.
 
-        Args:
-            place: file and line, key, option or folder.
-            do: sentences that say what to do.
+        `place` is a file and line, key, option or folder; `do` are sentences that say what to do.
         """
         parts = [f"found {found}" if found else "", f"expected {expected}" if expected else ""]
         said = ", ".join(part for part in parts if part)
@@ -154,9 +152,7 @@ _NO_PLACE = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR
 def shortage(kind: str, text: str) -> str | None:
     """Return a sentence about a lack of memory, disk space or permission; None for other errors.
 
-    Args:
-        kind: name of the exception.
-        text: its message; Python, HDF5, OpenCV, NumPy and torch word these differently.
+    Of the exception's name and its message; Python, HDF5, OpenCV, NumPy and torch word these differently.
     """
     if _MEMORY.search(f"{kind}: {text}"):
         detail = text.strip().splitlines()[0] if text.strip() else "no details"
@@ -184,11 +180,7 @@ EXTRAS = {
 
 
 def optional(package: str) -> Any:
-    """Import and return a package of an extra.
-
-    Raises:
-        ManifestError: it is not installed; says how to install it.
-    """
+    """Import and return a package of an extra; raise ManifestError that says how to install it."""
     try:
         return import_module(package)
     except ImportError as error:

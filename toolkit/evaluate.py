@@ -338,9 +338,7 @@ def _errors_of(
 ) -> pd.DataFrame:
     """Return a pair's rows of the table `errors`.
 
-    Args:
-        good: whether each query has a good reference; None if unknown.
-        length: the unit of lengths in the table, in the unit of the poses.
+    `good`: whether each query has a good reference; None if unknown. `length`: the unit of lengths in the table.
     """
     estimated, true = np.stack(results["pose"].to_list()), metrics.poses_of(truth, keys)  # type: ignore[arg-type]
     frame = results.drop(columns="pose")
@@ -415,9 +413,8 @@ def _retrieval_recall(
 ) -> tuple[dict[str, Any], NDArray[np.bool_] | None]:
     """Return a pair's row of the table `retrieval`, and whether each query has a good reference (None if unreadable).
 
-    Args:
-        unit, length: the unit of lengths in the table, and its length in the unit of the poses.
-        map_length: `Survey.length`, in the unit of the poses: far scenes show the same from further apart.
+    `length` is the table's unit of lengths, and `map_length` is `Survey.length`, in the unit of the poses: far scenes
+    show the same from further apart.
     """
     if not path.is_file():
         return {"state": "no retrieval file", "queries": len(keys)}, None

@@ -303,13 +303,9 @@ def is_current(path: str | Path, settings: dict[str, Any]) -> bool:
 
 
 def require_whole(path: str | Path, of: str | Path | None = None) -> None:
-    """Refuse a file that differs from its record. A file without a record is accepted: it is from another tool.
+    """Refuse a file that differs from its record, or from that of the artifact that it is `of`: raise ArtifactError.
 
-    Args:
-        of: the artifact that the file belongs to, if the record is that of the artifact.
-
-    Raises:
-        ArtifactError: the file is damaged or missing.
+    A file without a record is accepted: it is from another tool.
     """
     artifact = Path(of or path)
     if damage := _damage(artifact, _read_record(artifact), Path(path).name):
@@ -357,20 +353,14 @@ def why_older(
 def require_current(
     artifact: str | Path, stage: str, suffixes: Iterable[str] = (), missing: bool = True, inputs: str | None = None
 ) -> None:
-    """Refuse an artifact whose sources have changed since it was made; see `why_older`.
-
-    Raises:
-        ArtifactError: names the artifact and the first source.
-    """
+    """Refuse an artifact whose sources have changed since it was made, see `why_older`: raise ArtifactError."""
     if why := why_older(artifact, stage, suffixes, missing, inputs):
         raise ArtifactError(f"{Path(artifact).parent}: {why}")
 
 
 def older_files(folder: str | Path, stage: str) -> dict[str, str]:
-    """Return the files of a stage below its folder that are older than what they were made from, and why.
-
-    Returns:
-        The sentence of `why_older`, by path in the folder, for all files of these artifacts.
+    """Return the sentence of `why_older`, by path, for all files below a stage's folder whose artifact is older than
+    what it was made from.
     """
     older: dict[str, str] = {}
     for record in sorted(Path(folder).rglob("*.meta.json")):
@@ -388,9 +378,8 @@ _TIMES = {"seconds", "first_seconds"}
 
 
 def _content(path: str | Path) -> str | None:
-    """Return a hash of a file, which is quick for an artifact with a record; None if it is missing.
-
-    The time that queries took does not count: the same poses, computed again, are the same.
+    """Return a hash of a file, which is quick for an artifact with a record; None if it is missing. The time that
+    queries took does not count: the same poses, computed again, are the same.
     """
     try:
         if Path(path).suffix == ".csv":
@@ -544,10 +533,8 @@ def image_name(path: str) -> str:
 
 
 def own_name(name: str) -> str:
-    """Return the user's name of an image: for an imported image, its path in the folder it was imported from.
-
-    Args:
-        name: the image's path relative to `raw_data`, or its `image_name`; returned unchanged for other images.
+    """Return the user's name of an image: for an imported image, its path in the folder it was imported from; unchanged
+    for others. `name` is relative to `raw_data`, or an `image_name`.
     """
     return re.sub(f"^([^/]+/raw_data/)?{IMPORTED}", "", name)
 
@@ -558,10 +545,8 @@ def pair_name(scene: str, map_device: str, query_device: str) -> str:
 
 
 def pair_devices(stem: str) -> tuple[str, str]:
-    """Return map and query device of a file named after a pair, see `pair_name`; two empty ones of another file.
-
-    Args:
-        stem: its name without suffix; files of the sequence stage end in `_sequence`.
+    """Return map and query device of a file with the `pair_name` of a pair, or that and `_sequence`, as its `stem`; two
+    empty ones of another file.
     """
     devices = re.fullmatch(r".*_map_(.+?)_query_(.+?)(?:_sequence)?", stem)
     return (devices[1], devices[2]) if devices else ("", "")
@@ -596,11 +581,8 @@ def read_map_record(path: str | Path) -> dict[str, Any]:
 def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:
     """Return the rows of a file of references, one per query image.
 
-    A row has at least `timestamp` (an integer), `sensor_id`, and `topk`, a list of map images, each with a `path`. Rows
-    written by the toolkit have all keys described in the retrieve stage.
-
-    Args:
-        needed: further keys that each row must have.
+    A row has at least `timestamp` (an integer), `sensor_id`, and `topk`, a list of map images, each with a `path`, and
+    the `needed` keys. Rows written by the toolkit have all keys described in the retrieve stage.
 
     Raises:
         ArtifactError: the file is missing or damaged, or a line is not such a row.
@@ -672,11 +654,7 @@ def _remade(kind: type, made_with: bytes, expected: dict[str, Any] | None = None
 
 
 def require_same(expected: Mapping[str, Any], here: Mapping[str, Any]) -> None:
-    """Refuse to compute with settings that differ from those in the record of the results.
-
-    Raises:
-        ToolkitError: names the settings that differ.
-    """
+    """Refuse, by a ToolkitError, to compute with settings that differ from those in the record of the results."""
     differing = [name for name in {**expected, **here} if expected.get(name) != here.get(name)]
     found = "; ".join(f"{name}: {here.get(name)} here, {expected.get(name)} there" for name in differing)
     if found:

@@ -50,13 +50,10 @@ def quaternion_to_rotation(qwxyz: ArrayLike) -> Floats:
 
 
 def rotation_to_quaternion(rotation: ArrayLike) -> Floats:
-    """Return unit quaternions (..., 4), qw >= 0, of rotation matrices (..., 3, 3).
+    """Return unit quaternions (..., 4), qw >= 0, of rotation matrices (..., 3, 3); raise ValueError for another shape.
 
     Each is computed from its largest component (Shepperd 1978), which is exact also at 180 degrees. SciPy's conversions
     round differently, in both directions, and would change the last digits of poses in files.
-
-    Raises:
-        ValueError: wrong shape.
     """
     R = np.asarray(rotation, np.float64)
     if R.shape[-2:] != (3, 3):

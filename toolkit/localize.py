@@ -156,13 +156,8 @@ def build_maps(
     sessions_root: str | Path, retrieval_dir: str | Path, out_dir: str | Path, features_dir: str | Path,
     map_dir: str | Path, settings: LocalizeSettings, devices: Sequence[str],
 ) -> list[Map]:  # fmt: skip
-    """Build the maps of `devices` without queries, so that `Map.open` can open them.
-
-    Args:
-        sessions_root, retrieval_dir, out_dir, features_dir, map_dir, settings: see `localize_pairs`.
-
-    Raises:
-        ManifestError, WeightsError, CaptureError: see `localize_pairs`.
+    """Build the maps of `devices` without queries, so that `Map.open` can open them; the rest is as for
+    `localize_pairs`.
     """
     folders = _Folders(*map(Path, (sessions_root, retrieval_dir, out_dir, features_dir, map_dir)))
     stage, maps = _Stage(folders, resolve_auto(settings), "all", skip_existing=True), list[Map]()
@@ -200,11 +195,8 @@ class _Stage(Remade):
         time_ns: int = 0,
         made_by: Mapping[str, Any] | None = None,
     ) -> None:
-        """
-        Args:
-            folders, settings, queries, skip_existing, workers: see `localize_pairs`.
-            time_ns: when the work was distributed, so that a worker does not reuse a stage that it opened earlier.
-            made_by: the `networks` of the main process; a worker must have the same.
+        """Take the arguments of `localize_pairs`. A worker also takes the `networks` of the main process, which its own
+        must equal, and when the work was distributed, so that it does not reuse a stage that it opened earlier.
         """
         self.folders, self.queries = folders, queries
         self.skip_existing, self.workers = skip_existing, workers or default_workers()
@@ -356,9 +348,8 @@ class _Pair:
         return self
 
     def _add_features(self, kinds: Sequence[AnyMethod], numbers: Iterable[int]) -> None:
-        """Extract features of query images, and match them with their references if the matcher is a network.
-
-        If the map has no features of a kind, also extract those of the references.
+        """Extract features of query images, and match them with their references if the matcher is a network; also
+        those of the references if the map has none of a kind.
         """
         session, scene_map, stage = self.session, self.map, self.stage
         rows = np.unique(np.concatenate([*(self.rows[number] for number in numbers), np.zeros(0, np.int64)]))
@@ -388,11 +379,8 @@ class _Pair:
         return self.stored.query(self.map, self.rows[number])
 
     def _localize(self, record: dict[str, Any], h5_attributes: Mapping[str, str]) -> tuple[list[dict[str, Any]], bool]:
-        """Localize the queries that are not localized yet, and write the `.h5` file.
-
-        Returns:
-            Row of each query, with world_from_rig (4, 4) and covariance (6, 6), NaN if unknown; and whether a query
-            failed with an internal error.
+        """Localize the queries that are not localized yet, and write the `.h5` file. Return the row of each query, with
+        world_from_rig (4, 4) and covariance (6, 6), NaN if unknown; and whether a query failed with an internal error.
         """
         names, source = [query_group(*key) for key in self.keys], fingerprint(record)
         numbers = {name: number for number, name in enumerate(names)}  # a keyframe list may repeat a query
@@ -452,14 +440,11 @@ class _Pair:
     def localize_into(
         self, items: Items, todo: Sequence[_Todo], retry_s: float | None = None
     ) -> dict[int, QueryResult]:
-        """Localize queries and add them as items.
+        """Localize queries and add them as items; return those that failed with an internal error, by number: they get
+        no item, so the next run tries them again.
 
-        Args:
-            retry_s: retry unsure queries with the fallback features, whose extraction took these seconds per query;
-                an item gets arrays only if the result is better.
-
-        Returns:
-            Queries that failed with an internal error, by number. They get no item, so the next run tries them again.
+        With `retry_s`, retry unsure queries with the fallback features, whose extraction took these seconds per query;
+        an item gets arrays only if the result is better.
         """
         faulty = dict[int, QueryResult]()
         of_number = {number: (name, source) for name, source, number in todo}
@@ -549,15 +534,8 @@ def explain_query(
     queries: str = "keyframes_pruned_subsampled",
     index: int = 0,
 ) -> tuple[FeedForwardLocalizer, Query, FeedForwardAnswer]:
-    """Run the predictor on one query again, and return its full output, as `draw_prediction` takes it.
-
-    Args:
-        sessions_root, retrieval_dir, features_dir, map_dir, settings, queries: as given to `localize_pairs`.
-        map_device, query_device: the pair.
-        index: index of the query in the keyframe list.
-
-    Returns:
-        The localizer, the query, and the localizer's full output for it.
+    """Run the predictor on one query of a pair again, by its index in the keyframe list, with what `localize_pairs` was
+    given. Return the localizer, the query, and the localizer's full output for it, as `draw_prediction` takes it.
 
     Raises:
         ToolkitError: the method does not use a predictor.

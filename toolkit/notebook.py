@@ -182,11 +182,7 @@ def _require_outside_of_runs(name: str, folder: Path) -> None:
 
 
 def sessions_of(run: str | None, sessions_root: str | None) -> tuple[Path, Path | None]:
-    """Return the folder `sessions` of a notebook's capture, and the finished run that it is of, if any; see `start`.
-
-    Raises:
-        ArtifactError: there is no such run.
-    """
+    """Return the folder `sessions` of a notebook's capture, and the finished run that it is of, if any; see `start`."""
     if sessions_root is None and run is not None:
         stages = read_json((found := find_run(run)) / RECORD).get("stages")
         if stages:
@@ -335,10 +331,8 @@ _BALANCES = {"images": ("embedded", "unreadable"), "queries": _STATUSES, "frames
 def finish(table: "pd.DataFrame | None" = None, **counts: Any) -> None:
     """Display a notebook's counts, e.g. `images=120`, and hand them to the pipeline, with this process's peak memory.
 
-    Rows of the stage's table with a `reason` count as left out.
-
-    Raises:
-        AssertionError: counts that belong together do not balance, see `_BALANCES`.
+    Rows of the stage's table with a `reason` count as left out. Raise AssertionError if counts that belong together,
+    see `_BALANCES`, do not balance.
     """
     import resource
 
@@ -386,11 +380,7 @@ def copy_notebooks(folder: Path) -> list[str]:
 
 
 def notebook_parameters(path: Path) -> dict[str, Any]:
-    """Return names and defaults from the cell tagged `parameters`.
-
-    Raises:
-        ManifestError: there is no such cell, or it contains more than `name = literal` lines.
-    """
+    """Return names and defaults from the cell tagged `parameters`; raise ManifestError if it has more than literals."""
     try:
         return _literals(_listing(path))
     except (SyntaxError, ValueError) as error:
@@ -407,11 +397,7 @@ def _listing(path: Path) -> str:
 
 
 def check_parameters(path: Path, parameters: Iterable[str]) -> None:
-    """Refuse parameters that the notebook `path` does not have; papermill would only warn.
-
-    Raises:
-        ManifestError: a parameter is unknown; the message names the nearest known one.
-    """
+    """Raise ManifestError for parameters that the notebook `path` does not have; papermill would only warn."""
     known = notebook_parameters(path)
     for name in parameters:
         if name not in known:
@@ -419,10 +405,8 @@ def check_parameters(path: Path, parameters: Iterable[str]) -> None:
 
 
 def _take_from_run(stage: str, files: SceneFiles, run: Path | None) -> None:
-    """Fill the folder of notebooks by hand, as far as no notebook has made results there, with hard links.
-
-    They lead to results of a finished run. If that run changes, its new results are taken. Caches are taken once, as
-    stages find in them what still fits.
+    """Fill the folder of notebooks by hand, as far as no notebook has made results there, with hard links to those of a
+    finished run: new ones if that changes. Caches are taken once, as stages find in them what still fits.
     """
     record, made_here = files.root / ".taken.json", files.of_stage(stage)
     taken = read_json(record)
@@ -488,10 +472,8 @@ def _user_names() -> dict[str, Any]:
 
 
 def check_given(name: str) -> None:
-    """Refuse wrong parameter values in the running notebook, and unknown parameters that papermill has injected.
-
-    Raises:
-        ManifestError: names the parameter, what was found and what was expected.
+    """Refuse, by a ManifestError that names them, wrong parameter values in the running notebook, and unknown
+    parameters that papermill has injected.
     """
     values = _user_names()
     for source in values.get("In", []):
@@ -557,10 +539,8 @@ def _check_devices_and_queries(stage: str, sessions: Path) -> None:
 
 
 def stage_settings(stage: str, values: Mapping[str, Any]) -> Settings:
-    """Return the settings of a stage from the parameters of its notebook, overridden by its dict `settings`.
-
-    Raises:
-        ManifestError: a value or a name is wrong; names the parameter, what was found and what was expected.
+    """Return the settings of a stage from the parameters of its notebook, overridden by its dict `settings`; raise
+    ManifestError that names a wrong one.
     """
     section = type(Manifest.defaults(stage))
     known = notebook_parameters(notebook_path(stage)).keys() & values.keys()
@@ -570,11 +550,7 @@ def stage_settings(stage: str, values: Mapping[str, Any]) -> Settings:
 
 
 def check_names(settings: Settings) -> None:
-    """Refuse unknown names of embedders, local features, matchers and indices.
-
-    Raises:
-        ManifestError: names the unknown one, the nearest known one, and all known ones.
-    """
+    """Raise ManifestError for unknown names of embedders, local features, matchers and indices."""
     if isinstance(settings, EmbedSettings):
         from toolkit.embedders import resolve_name
 
@@ -589,11 +565,8 @@ def check_names(settings: Settings) -> None:
 
 
 def check_values(name: str, values: Mapping[str, Any]) -> None:
-    """Refuse parameters of the notebook `<number>_<name>.ipynb`, which include a stage's settings, of a wrong type or
-    value; names that are no parameters of it are ignored.
-
-    Raises:
-        ManifestError: names the first wrong parameter, what was found, what was expected, and what it means.
+    """Refuse, by a ManifestError that names the first one, parameters of the notebook `<number>_<name>.ipynb`, which
+    include a stage's settings, of a wrong type or value; names that are no parameters of it are ignored.
     """
     path, given = notebook_path(name), dict[str, Any]()
     defaults, meanings = notebook_parameters(path), dict(re.findall(r"^(\w+) = .*  # (.+)", _listing(path), re.M))

@@ -134,11 +134,8 @@ class Job:
 
 
 def open_run(folder: str | Path, notebook: str = "start") -> "Run":
-    """Open a run for a notebook, see `notebook.find_run`; the demo is run first if it has not been yet.
-
-    Args:
-        folder: the run folder.
-        notebook: name of the notebook, whose parameters are checked.
+    """Open a run for a notebook, whose parameters are checked; see `notebook.find_run`. The demo is run first if need
+    be.
 
     Raises:
         ArtifactError: there is no such run; the message lists runs beside it.
@@ -154,15 +151,10 @@ def open_run(folder: str | Path, notebook: str = "start") -> "Run":
 
 
 def runs_to_compare(folder: str | Path, others: Sequence[str | Path] | None = None) -> list[Path]:
-    """Return a run and those to compare it with, for a notebook.
+    """Return a run and those to compare it with, for a notebook; by default, the runs beside it whose names begin with
+    its name, as a sweep makes them. If the demo has none, it is run with SIFT features alone.
 
-    Args:
-        folder: see `open_run`.
-        others: run folders; None: the runs beside it whose names begin with its name, as a sweep makes them. If the
-            demo has none, it is run with SIFT features alone.
-
-    Raises:
-        ArtifactError: a folder is no run, or there is nothing to compare with.
+    Raise ArtifactError if a folder is no run, or there is nothing to compare with.
     """
     first = open_run(folder, "compare").path
     if others is not None:
@@ -237,11 +229,8 @@ def run(
 def run_name(
     manifest_path: str | Path, manifest: Manifest, overrides: Sequence[str], name: str | None = None
 ) -> tuple[Manifest, str]:
-    """Return a manifest without its overrides, and the name of the run with them.
-
-    Args:
-        manifest: content of `manifest_path`, with the overrides.
-        name: chosen by the user; None: named after the overrides that change a result.
+    """Return a manifest, of `manifest_path`, without its overrides, and the name of the run with them: the one that the
+    user chose, else named after the overrides that change a result.
     """
     try:
         plain = load_manifest(manifest_path)

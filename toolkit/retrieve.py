@@ -149,8 +149,7 @@ def index_maps(
 ) -> None:  # fmt: skip
     """Do what `retrieve_pairs` does for the maps of `devices`, without queries: indexes, and the settings in a file.
 
-    Raises:
-        CaptureError, ArtifactError: a map has no embedded image with a pose, or a value is not finite.
+    Raise CaptureError or ArtifactError if a map has no embedded image with a pose, or a value is not finite.
     """
     capture, embeddings = Capture.from_sessions_root(sessions_root), Path(map_feats_root)
     for device in devices:
@@ -237,11 +236,7 @@ def _require_same_dimension(query: _Images, database: _Images) -> None:
 def _search(
     queries: Mapping[str, _Images], database: _Images, settings: RetrieveSettings, embeddings: Path, again: bool
 ) -> dict[str, Found]:
-    """Return the best map images of several sets of queries, with one pass over the map.
-
-    Raises:
-        ArtifactError: a value is not finite.
-    """
+    """Return the best map images of several sets of queries, with one pass over the map; all values must be finite."""
     stacked = Vectors.stack([query.vectors for query in queries.values()])
     backend: Backend = "faiss" if settings.use_faiss else "torch"
     masks = [query.masks for query in queries.values() if query.masks is not None]

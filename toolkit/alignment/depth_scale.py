@@ -70,11 +70,7 @@ class DepthRatios:
 
     @classmethod
     def of(cls, ratios: DepthSamples | None, count: int) -> DepthRatios:
-        """Check the `depth_ratios` of `align_to_map` for `count` references.
-
-        Raises:
-            AlignmentError: a wrong shape.
-        """
+        """Check the `depth_ratios` of `align_to_map` for `count` references. Raise AlignmentError for a wrong shape."""
         reference = np.zeros(0, np.int64)
         if ratios is None:
             return cls(np.zeros(0), reference, [])
@@ -103,14 +99,11 @@ class DepthRatios:
         return len(self.reference) > 0 and bool(self.reference[0] >= 0)
 
     def estimate(self, inliers: Bools | None) -> ScaleEstimate | None:
-        """Return the scale from the samples; None without samples.
+        """Return the scale from the samples of some references, (M,) bool, or of all; None without samples.
 
         Expectation maximization fits a mixture of noise around one value and uniformly distributed wrong samples. It
         starts from the middle of the shortest interval that contains half of the samples (Rousseeuw 1984). The error
         that the samples of one reference share is estimated by moments (DerSimonian and Laird 1986).
-
-        Args:
-            inliers: (M,) references whose samples are used; None uses all. Ignored if the references are unknown.
         """
         kept = inliers[self.reference] if self.grouped and inliers is not None else np.ones(len(self.log), bool)
         log, reference = self.log[kept], self.reference[kept]

@@ -263,10 +263,7 @@ def is_trustworthy(alignment: Alignment, covariance: Floats) -> bool:
 
 
 class _Problem:
-    """The M references in both frames.
-
-    K hypotheses are processed at once. Their members (K, M) are the probabilities that each reference is correct.
-    """
+    """The M references in both frames, for K hypotheses at once; `members` (K, M) are probabilities to be correct."""
 
     def __init__(self, model: Floats, world: Floats, weight: Floats, center_noise_m: float, rotation_noise_deg: float):
         self.weight = weight

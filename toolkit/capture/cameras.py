@@ -12,11 +12,7 @@ _LARGEST = 2**31 - 1  # largest image side, pixels; COLMAP cannot hold larger nu
 
 
 def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
-    """Return the camera of a line of sensors.txt.
-
-    Args:
-        sensor_type: `camera` or `depth`.
-        params: the text after the sensor type: `MODEL, width, height, parameter, ...`.
+    """Return the camera of a line of sensors.txt: its type, `camera` or `depth`, and the text after it.
 
     Raises:
         ValueError: the sensor is not a camera, or its model, size or parameters are not valid.
@@ -130,10 +126,8 @@ def view_bounds(camera: pycolmap.Camera) -> Floats:
 
 
 def in_view(points_in_cams: Floats, bounds: Floats) -> NDArray[np.bool_]:
-    """Tell which points (J, P, 3) in the frames of J cameras lie in their fields of view; (J, P) bool.
-
-    Args:
-        bounds: (J, 4), as `view_bounds` returns them.
+    """Tell which points (J, P, 3) in the frames of J cameras lie in their fields of view, `view_bounds` (J, 4); bool
+    (J, P).
     """
     z = points_in_cams[..., 2]
     x, y = points_in_cams[..., 0] / np.maximum(z, 1e-6), points_in_cams[..., 1] / np.maximum(z, 1e-6)

@@ -88,11 +88,7 @@ class CheckReport:
 def check_capture(path: str | Path, deep: bool = False) -> CheckReport:
     """Read all sessions of a capture and the headers of its images, and list all inconsistencies.
 
-    Args:
-        deep: also decode every image and depth map.
-
-    Raises:
-        CaptureError: the folder is not a capture.
+    With `deep`, every image and depth map is decoded. Raise CaptureError if the folder is not a capture.
     """
     capture = Capture.open(path)
     report = CheckReport(capture.path)

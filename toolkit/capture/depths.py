@@ -109,10 +109,9 @@ class DepthMaps:
         self._logged: set[str] = set()
 
     def _see(self, row: int) -> SeenDepth:
-        """Return the depth in a photograph, given as a row of `Session.images`.
-
-        Each depth sensor that belongs to the camera contributes its depth map nearest in time, within `MAX_OFFSET_US`.
-        A depth map that cannot be read or does not fit its sensor is left out; the reason is logged once.
+        """Return the depth in a photograph, a row of `Session.images`: of each depth sensor of its camera, the depth
+        map nearest in time, within `MAX_OFFSET_US`. One that cannot be read or does not fit is left out, and logged
+        once.
         """
         image = self._session.images.iloc[row]
         camera = self._session.camera(str(image["sensor_id"]))
@@ -212,11 +211,7 @@ class DepthMaps:
         return geometry.make_pose(rotation, (1 - share) * poses[after - 1, :3, 3] + share * poses[after, :3, 3])
 
     def _points(self, source: _DepthMap, photograph: pycolmap.Camera) -> tuple[Floats, float]:
-        """Return the points (P, 3) of a depth map in the photograph's camera, and their spacing in its pixels.
-
-        Raises:
-            CaptureError: the depth map cannot be read, or its size does not fit the camera.
-        """
+        """Return the points (P, 3) of a depth map in the photograph's camera, and their spacing in its pixels."""
         path = self._session.path / RAW_DATA / source.path
         depth = read_depth(path)
         height, width = depth.shape

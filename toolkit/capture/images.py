@@ -82,11 +82,7 @@ def _open(path: str | Path) -> Iterator[BinaryIO]:
 
 
 def stored_size(path: str | Path) -> tuple[int, int]:
-    """Return width and height of an image file, from its header.
-
-    Raises:
-        ImageError: see `read_file`; or the file has no image header.
-    """
+    """Return width and height of an image file, from its header. Raise ImageError if it has none."""
     with _open(path) as stream:
         try:
             return open_lazily(stream, np.inf).size
@@ -183,10 +179,8 @@ def shrunk(image: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
 
 
 def read_for_display(path: str | Path, longest: int) -> NDArray[np.uint8]:
-    """Return an image, (H, W, 3) RGB; for an unreadable file, a gray one with the text `unreadable`.
-
-    Args:
-        longest: limit of its longer side, pixels. Matplotlib is slow at reducing images.
+    """Return an image, (H, W, 3) RGB, of at most `longest` pixels; for an unreadable file, one with the text
+    `unreadable`.
     """
     try:
         return read_image(path, longest=longest)
@@ -197,11 +191,7 @@ def read_for_display(path: str | Path, longest: int) -> NDArray[np.uint8]:
 
 
 def thumbnails(images: Iterable[Path | NDArray[np.uint8]], size: int = 110) -> str:
-    """Return `<img>` elements that contain small copies of images, files or pixels, in RGB.
-
-    Args:
-        size: longer side of a copy, pixels.
-    """
+    """Return `<img>` elements of small copies, `size` pixels on the longer side, of images, files or pixels, in RGB."""
     elements = []
     for image in images:
         small = read_for_display(image, size) if isinstance(image, Path) else shrunk(image, size)

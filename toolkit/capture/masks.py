@@ -120,11 +120,7 @@ def near(world_from_cams: Floats, world_from_cam: Floats, distance_m: float, ang
 def pose_masks(
     poses: Trajectory, map_images: Images, query_images: Images, distance_m: float, angle_deg: float
 ) -> Masks:
-    """Return masks of the map images that are `near` the roughly known poses of query images.
-
-    Args:
-        poses: world_from_device of the query rigs, or else of their cameras, in the map's frame.
-    """
+    """Return masks of the map images that are `near` the roughly known poses, world_from_device, of query images."""
     session, rows = query_images
     times, sensors = times_of(session.images)[rows], session.images["sensor_id"].iloc[rows]
     of_rig = poses.lookup(times, session.device_ids[rows]) @ session.rig_from_cam(rows)
@@ -252,11 +248,8 @@ def _strengths(images: Images, signals: pd.DataFrame, emitters: pa.Array, window
 def _within(images: Images, table: pd.DataFrame, window_s: float) -> tuple[csr_array, Ints]:
     """Return which of L lines of a table belong to an image: those of its recording within the time window.
 
-    A line belongs to the recording whose name its sensor id begins with; without such a name, to all recordings.
-
-    Returns:
-        A matrix (S, L) with one row per distinct set of lines, 1 for the lines in it; and the row of each image,
-        -1 without any line.
+    A line belongs to the recording whose name its sensor id begins with; without such a name, to all recordings. The
+    result is a matrix (S, L), a row per distinct set of lines; and the row of each image, -1 without any line.
     """
     session, rows = images
     names = sorted(session.subsessions, key=len)

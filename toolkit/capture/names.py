@@ -59,11 +59,7 @@ def has_long_part(name: str, kind: str) -> bool:
 
 
 def require_name(name: str, kind: str, place: str | Path) -> None:
-    """Raise CaptureError if outputs cannot be named after a `capture`, `session` or `subsession` (the kind).
-
-    Args:
-        place: file or folder with the name, for the message.
-    """
+    """Raise CaptureError at a place if outputs cannot be named after a kind: `capture`, `session` or `subsession`."""
     if is_bad_name(name) or ("/" in name and kind != "subsession"):
         raise CaptureError(f"{place}: found the {kind} {name!r}, expected {EXPECTED_NAME}. Rename it.")
     if has_long_part(name, kind):

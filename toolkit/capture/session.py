@@ -525,13 +525,8 @@ def _find_rigs(
     """Return the row of rigs.txt for each (timestamp, sensor), (n,), -1 where no rig holds the sensor.
 
     A sensor can be in any number of rigs, because rig ids often differ from frame to frame. The rig is the one with a
-    pose or a keyframe at that time; without any, the sensor's only rig; as a last resort, the rig named after the
-    timestamp.
-
-    Args:
-        rigs: table [rig_id, sensor_id].
-        timestamps, sensors: n keys.
-        posed: timestamps and device ids of poses and keyframes, one pair per file; the first file with an entry wins.
+    pose or a keyframe at that time (`posed`: of several files, the first with an entry wins); without any, the sensor's
+    only rig; as a last resort, the rig named after the timestamp.
     """
     rig_rows = np.full(len(timestamps), -1, np.int64)
     if rigs is None or rigs.empty:

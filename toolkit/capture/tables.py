@@ -91,11 +91,7 @@ class TextTable:
         return f"{self.path}, line {self.lines[row]}"
 
     def repeated(self, key: list[str]) -> Ints:
-        """Return the rows that repeat the key of an earlier row, ascending, and log the first.
-
-        Raises:
-            CaptureError: a repeated row differs from the earlier one.
-        """
+        """Return the rows that repeat a key, ascending, and log the first; raise CaptureError if its values differ."""
         if key[0] == "timestamp" and np.all(np.diff(self.columns["timestamp"].to_numpy()) > 0):
             return np.zeros(0, np.int64)  # the usual case: distinct timestamps make distinct keys
         keys = self.frame(*key)

@@ -35,12 +35,8 @@ SHARES = {"sensor": 0.0, "role": MAJORITY, "name": MAJORITY, "device": MAJORITY}
 
 @dataclass(frozen=True)
 class _TurnsByName:
-    """Quarter turns by sensor name, decided by the votes of map images.
-
-    Attributes:
-        names: (n,) texts.
-        turns: (n,) quarter turns, -1 if the votes do not decide.
-        ups: (n, 3) mean up directions in camera coordinates, unit length.
+    """Quarter turns (n,) by sensor name, decided by the votes of map images, -1 if they do not decide; and mean up
+    directions `ups` (n, 3) in camera coordinates, unit length.
     """
 
     names: pd.Index
@@ -49,12 +45,8 @@ class _TurnsByName:
 
     @classmethod
     def learn(cls, names: pd.Series, up_in_cams: Floats, share: float) -> "_TurnsByName":
-        """Decide by the votes of images.
-
-        Args:
-            names: (n,) name of each image's sensor; an image with None does not vote.
-            up_in_cams: (n, 3) up direction in each image's camera coordinates.
-            share: share of a name's votes needed for a decision.
+        """Decide by the votes of images, each with a sensor name (None: no vote) and an up direction (3,) in the
+        camera; `share` is that of a name's votes needed for a decision.
         """
         codes, unique = pd.factorize(names, sort=True)
         up_in_cams, codes = up_in_cams[codes >= 0], codes[codes >= 0]
@@ -210,12 +202,9 @@ def turn_points(xy: ArrayLike, width: int, height: int, k: int) -> Floats:
 
 
 def turned_from_cam(k: ArrayLike) -> Floats:
-    """Return turned_from_cam, (..., 4, 4): it maps camera coordinates to those of the camera after k quarter turns.
+    """Return turned_from_cam, (..., 4, 4), of k quarter turns (...): from the camera's coordinates to the turned one's.
 
     The pose of a turned image is world_from_cam @ invert(turned_from_cam(k)).
-
-    Args:
-        k: quarter turns, any shape.
     """
     quarter = np.eye(4)
     quarter[:2, :2] = [[0, 1], [-1, 0]]  # right becomes up (-y)

@@ -29,13 +29,7 @@ DECISIVE = 0.5  # log; smallest difference of the scores of up and down that dec
 
 @dataclass(frozen=True, eq=False)
 class WorldUp:
-    """The up direction of a capture's world.
-
-    Attributes:
-        direction: (3,) float64, unit length.
-        known: False if the sign is a guess.
-        reason: how it was determined, for messages.
-    """
+    """The up direction (3,) of a capture's world, unit length; whether its sign is `known`; how it was determined."""
 
     direction: Floats
     known: bool
@@ -188,10 +182,8 @@ class _UpLikelihood:
         self.weight = min(1.0, 100 / len(axes))
 
     def _likelihoods(self, ups: Floats) -> tuple[Floats, Floats]:
-        """Return the likelihood that each image needs 0 to 3 quarter turns, (4, n, c), and the sines of pitch, (n, c).
-
-        Args:
-            ups: (c, 3) candidate up directions.
+        """Return the likelihoods that each image needs 0 to 3 turns, (4, n, c), for ups (c, 3), and sines of pitch (n,
+        c).
         """
         right, down, forward = np.moveaxis(np.einsum("nij,ci->jnc", self.axes, ups), 0, 0)
         roll = np.exp(-0.5 * (np.stack([right, down]) / SIGMA_ROLL) ** 2)

@@ -67,9 +67,7 @@ WEIGHTS = {"megaloc": MEGALOC}
 def resolve_name(name: str, checkpoint: str | Path | None = None) -> str:
     """Return the name of the embedder; for `auto`, the first whose weights are on this machine, if it needs any.
 
-    Raises:
-        ManifestError: unknown embedder.
-        WeightsError: the file `checkpoint` is missing.
+    Raise ManifestError for an unknown embedder; WeightsError if the file `checkpoint` is missing.
     """
     if name == "auto":
         return next(key for key in EMBEDDERS if key not in WEIGHTS or find_weights(WEIGHTS[key], checkpoint))

@@ -45,8 +45,7 @@ class VectorIndex:
     def find(self, query: NDArray[np.float32], allowed: NDArray[np.bool_] | None = None) -> Ints:
         """Return the candidate rows (Q, C) int64 of each query (Q, sum of D), which may repeat; -1 pads missing ones.
 
-        Args:
-            allowed: (N,) rows that may be returned; None: all.
+        Only rows that are `allowed`, (N,), are returned; None: all.
         """
         selector = None if allowed is None else faiss.IDSelectorBitmap(np.packbits(allowed, bitorder="little"))
         found, end = [], 0
@@ -76,14 +75,7 @@ def make_index(
 ) -> VectorIndex | None:
     """Build the index of a map, or read the current one; None if none is needed, see `load_index`.
 
-    Needs memory for the index and for 1 GB of vectors.
-
-    Args:
-        embeddings: folder of the embeddings. The index is a file in the folder `index` beside it; with several
-            descriptors, each has a subfolder with its name.
-        map_id: the map session.
-        vectors: (N, D) of the map.
-        skip_existing: reuse the file if it was made from these vectors.
+    It is a file in the folder `index` beside that of the embeddings. Needs memory for it and for 1 GB of vectors.
 
     Raises:
         ManifestError: FAISS has no such index, or cannot build it from N vectors.
@@ -102,10 +94,8 @@ def is_index_current(embeddings: Path, map_id: str, vectors: Vectors, settings: 
 
 
 def load_index(embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveSettings) -> VectorIndex | None:
-    """Read the index that the retrieve stage built for a map; None for an exact search.
-
-    The search is exact if the settings say so, or if the map has no more vectors than the index has candidates, cells
-    or PCA dimensions.
+    """Read the index that the retrieve stage built for a map; None for an exact search: if the settings say so, or if
+    the map has no more vectors than the index has candidates, cells or PCA dimensions.
 
     Raises:
         ArtifactError: the file is missing or damaged, or was made from other vectors.

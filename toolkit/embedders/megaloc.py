@@ -34,14 +34,9 @@ class MegaLocEmbedder(Remade):
         dtype_compute: str = "auto",
         image_size: int = 322,
     ) -> None:
-        """
-        Args:
-            checkpoint: the official file, its tensors by name, or a network; None: the file in the hub's cache,
-                downloaded if it is not there.
-            device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
-            dtype_compute: `float32`, `bfloat16`, `float16`; `auto`: the fastest on the device, see `resolve_precision`.
-            image_size: side of the square to which images are resized, pixels, a multiple of 14; the aspect ratio is
-                not kept.
+        """Take the official file, its tensors by name, or a network; None: the hub's cache, or a download.
+
+        Images are resized to a square of `image_size` pixels, a multiple of 14, whatever their aspect ratio.
 
         Raises:
             WeightsError: the weights are missing, or of another network.
@@ -72,10 +67,8 @@ class MegaLocEmbedder(Remade):
         return {"name": self.name, "weights": self._weights, **sizes, "dtype_compute": precision}
 
     def prepare(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Resize an image (H, W, 3) or (H, W), uint8 RGB or gray, to the network's input (S, S, 3).
-
-        Raises:
-            ValueError: wrong shape or type.
+        """Resize an image (H, W, 3) or (H, W), uint8 RGB or gray, to the network's input (S, S, 3), else raise
+        ValueError.
         """
         image = np.asarray(image)
         if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)) or not image.size:

@@ -208,13 +208,8 @@ def _matrix(values: ArrayLike | Vectors, name: str) -> _Vectors:
 
 
 def _candidates(vectors: _Vectors, best: _Best, queries: int, width: int, size: int) -> tuple[_Floats, Ints, float]:
-    """Find candidates with the backend.
-
-    Args:
-        size: bytes of a block of the database.
-
-    Returns:
-        The `width` best scores and rows (Q, width), best first up to rounding, and the length of the longest vector.
+    """Return the `width` best scores and rows (Q, width), best first up to rounding, and the length of the longest
+    vector, by the backend, in blocks of `size` bytes.
     """
     scores, indices = np.zeros((queries, 0), np.float32), np.zeros((queries, 0), np.int64)
     longest = 0.0

@@ -127,11 +127,8 @@ def blocks(vectors: NDArray[Any] | Vectors, size: int) -> Iterator[tuple[int, ND
 
 
 def require_finite(matrix: NDArray[np.float32], name: str, first: int | Ints = 0) -> None:
-    """Raise ValueError if a value is not finite.
-
-    Args:
-        name: name of the matrix, for the message.
-        first: number of its first row, or the numbers of all its rows.
+    """Raise ValueError if a value of the matrix `name` is not finite; `first` is the number of its first row, or of
+    all.
     """
     bad = ~np.isfinite(matrix).all(axis=1)
     if bad.any():
@@ -141,10 +138,7 @@ def require_finite(matrix: NDArray[np.float32], name: str, first: int | Ints = 0
 
 
 def open_embeddings(folder: str | Path) -> tuple[Vectors, pd.DataFrame]:
-    """Open the embeddings of a session, or of one subsession; vectors stay on disk until they are indexed.
-
-    Args:
-        folder: `<embeddings>/<session>` or `<embeddings>/<session>/<subsession>`.
+    """Open the embeddings in `<embeddings>/<session>`, or in a subsession's folder there; vectors stay on disk.
 
     Returns:
         The vectors (N, D), and a table of their images: row_index, device_id, sensor_id, timestamp, abs_path,
@@ -198,11 +192,7 @@ def embedding_folders(embeddings: str | Path) -> dict[str, Path]:
 def open_descriptors(embeddings: str | Path, session: str, normalize: bool) -> tuple[Vectors, pd.DataFrame]:
     """Open all descriptors of a session; with several, only the images that have all of them.
 
-    Args:
-        normalize: scale the vectors of each descriptor to length 1 when reading.
-
-    Raises:
-        ArtifactError: see `open_embeddings`; or no image has all descriptors.
+    With `normalize`, the vectors of each have length 1. Raise ArtifactError as `open_embeddings`, or without an image.
     """
     opened = {name: open_embeddings(folder / session) for name, folder in embedding_folders(embeddings).items()}
     parts = {name: replace(vectors.parts[""], normalize=normalize) for name, (vectors, _) in opened.items()}

@@ -115,12 +115,8 @@ class Vlad:
     def learn(cls, features: Callable[[], Iterable[LocalFeatures]], count: int, seed: int = 0) -> "Vlad":
         """Learn vocabulary and projection from `count` map images; equal inputs give equal bytes.
 
-        Args:
-            features: yields the features of the images, in the same order at each call. It is called twice, so memory
-                does not grow with the number of local features.
-
-        Raises:
-            ToolkitError: the images have no local features.
+        `features` yields the features of the images, in the same order at each call. It is called twice, so memory does
+        not grow with the number of local features. Raise ToolkitError if the images have no local features.
         """
         share = -(-SAMPLE_DESCRIPTORS // max(count, 1))
         parts, all_keys = [], []
@@ -181,9 +177,8 @@ def _keys(descriptors: Floats, seed: int) -> NDArray[np.uint32]:
 
 
 def _whitening(sample: Floats, dim: int) -> dict[str, Floats]:
-    """Return the PCA whitening of RootSIFT vectors (N, 128): `(512 * vectors @ projection - offset) * scale`.
-
-    The projection (128, dim) holds integers, so products with stored RootSIFT vectors, integers / 512, are exact.
+    """Return the PCA whitening of RootSIFT vectors (N, 128): `(512 * vectors @ projection - offset) * scale`, where the
+    projection (128, dim) holds integers, so products with stored RootSIFT vectors, integers / 512, are exact.
     """
     squares, sums = np.zeros((sample.shape[1],) * 2), np.zeros(sample.shape[1])
     for start in range(0, len(sample), _CHUNK):  # exact in float64, as descriptors are integers / 512
@@ -212,11 +207,7 @@ def _assign(points: Floats, centroids: Floats) -> NDArray[np.intp]:
 
 
 def _kmeans(points: Floats, words: int, iterations: int, keys: NDArray[np.uint32]) -> Floats:
-    """Return centroids (words, D) by Lloyd's algorithm.
-
-    Args:
-        keys: (N,) a number of each point; points with the smallest ones are the first centroids.
-    """
+    """Return centroids (words, D) by Lloyd's algorithm, from the points with the smallest `keys` (N,)."""
     order = np.unique(keys, return_index=True)[1]  # equal points, as of equal images, are one choice
     order = np.concatenate([order, np.setdiff1d(np.arange(len(points)), order)])
     seeds = points[order]

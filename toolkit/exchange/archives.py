@@ -30,9 +30,7 @@ class FileError(DownloadError):
 def unpack(archive: Path, target: Path, target_path: Callable[[str], str | None], name: str) -> None:
     """Unpack a zip archive into a new folder: regular files only, nothing outside of it, no more than the disk holds.
 
-    Args:
-        target_path: maps a member's path to its path below `target` (with `/`), or to None to skip it.
-        name: name of the archive in messages and the progress bar.
+    `target_path` maps a member's path to its path below `target`, or to None to skip it; `name` is for messages.
 
     Raises:
         DownloadError: a member's path leaves the folder; a member is no regular file, is encrypted, or occurs twice;
@@ -87,11 +85,8 @@ def size_text(count_bytes: int) -> str:
 def arrange(sessions: Path, names: Mapping[str, str]) -> list[str]:
     """Rename the sessions of a data set; split by device, in place, a session that several new names refer to.
 
-    The subsessions of a device have names that begin with `<device>_`. Return notes on what was left out.
-
-    Args:
-        sessions: folder of the sessions. Those that are not in `names` stay as they are.
-        names: for each new name, `<device>_<map or query>`, the session's name in the data set.
+    The subsessions of a device have names that begin with `<device>_`. `names` has, for each new name `<device>_<map or
+    query>`, the session's name in the data set; others stay as they are. Return notes on what was left out.
 
     Raises:
         CaptureError: a session to split has no subsession of a device, or an invalid subsession name.

@@ -94,8 +94,7 @@ def read_model(folder: Path) -> ColmapModel:
 def read_cameras(path: Path) -> dict[str, pycolmap.Camera | str]:
     """Return the cameras in cameras.txt or cameras.bin by id as text; each may be why it cannot be used.
 
-    Raises:
-        CaptureError: the file is missing, damaged (names line or byte), or has no camera.
+    Raise CaptureError if the file is missing, damaged (names line or byte), or has no camera.
     """
     model = ColmapModel()
     try:

@@ -67,7 +67,6 @@ def import_dataset(
     Args:
         kind: one of `LAYOUTS`.
         path: folder of the data set, or of one of its scenes.
-        capture, device: as for `interchange.import_colmap`.
         scene: folder of the scene in `path`, such as `chess`; None: `path` is the scene.
         every: take only every such image of each folder.
         options: see `drafts.Options`; in data sets without a split, `hold_out` is `HOLD_OUT` by default.
@@ -215,9 +214,8 @@ def _depth_in(name: str, pattern: str, **options: Any) -> Callable[[Path], dict[
 
 
 def _cambridge(folder: Path) -> tuple[Path, list[Photograph]]:
-    """Read the lists of training and test images. Focal lengths are those of the structure from motion, if it is there.
-
-    The lists have the camera's center, and the rotation of cam_from_world.
+    """Read the lists of training and test images: the camera's center, and the rotation of cam_from_world. Focal
+    lengths are those of the structure from motion, if it is there.
     """
     focals = dict[str, float]()
     if (folder / "reconstruction.nvm").is_file():

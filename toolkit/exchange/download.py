@@ -123,8 +123,7 @@ class RemoteFile:
     def fetch(self, partial: Path, headers: Mapping[str, str], bar: Any) -> None:
         """Fetch the missing bytes to `partial`, which may hold the first ones already, and advance a tqdm bar.
 
-        Raises:
-            Exception: an error of the disk, of huggingface_hub, or of its HTTP client; `partial` stays.
+        An error of the disk, of huggingface_hub, or of its HTTP client is raised; `partial` stays.
         """
         from huggingface_hub.file_download import http_get
 

@@ -189,12 +189,10 @@ class Draft(Options):
         self, name: str, camera: pycolmap.Camera | str, world_from_cam: Floats | str | None, origin: str,
         time_us: int | None = None,
     ) -> None:  # fmt: skip
-        """Add an image that is not in a rig. Images with equal intrinsics share a camera.
+        """Add an image that is not in a rig, with the `origin` of its intrinsics. Images with equal intrinsics share a
+        camera.
 
-        Args:
-            camera, world_from_cam: each may be why there is none, and the image is left out.
-            origin: where its intrinsics are from.
-            time_us: when it was taken, microseconds; None: from EXIF.
+        Camera or pose may be why there is none, and the image is left out. Without `time_us`, its time is from EXIF.
         """
         if isinstance(camera, str) or isinstance(world_from_cam, str):
             self.rows.append({"image": name, "status": camera if isinstance(camera, str) else world_from_cam})
@@ -279,10 +277,7 @@ class Draft(Options):
             self._align()
 
     def _align(self) -> None:
-        """Move the poses to the world of known camera centers, or of GPS in EXIF: z is up, in meters.
-
-        If they do not tell it, the poses stay, and their unit is unknown.
-        """
+        """Move the poses to the world of known camera centers, or of GPS: z is up, in meters, if they tell it."""
         poses = self._camera_poses([image for image in self.images if is_file(self.source(image.name))])
         turns = dict[str, int]()
         for name in poses:
@@ -334,8 +329,7 @@ class Draft(Options):
     def follow(self) -> None:
         """Fit the images to the session that they are added to: leave out what it has; give sensors and rigs new ids.
 
-        Raises:
-            CaptureError: it has another unit, or all the images.
+        Raise CaptureError if it has another unit, or all the images.
         """
         if not (self.add and self.session.is_dir()):
             return
@@ -369,10 +363,8 @@ class Draft(Options):
         return self.sources.get(name, self.folder / name)
 
     def _find_masks(self) -> dict[str, Path]:
-        """Return the masks of the images by name, and note those that do not fit.
-
-        Raises:
-            CaptureError: the user gave a folder of masks, but no image has one there.
+        """Return the masks of the images by name, and note those that do not fit; raise CaptureError if a given folder
+        has none.
         """
         folder = None if self.masks is None else Path(self.masks)
         found = {image.name: self.mask_files.get(image.name) or find_mask(self.source(image.name), folder)
@@ -708,10 +700,8 @@ def _append(made: Path, session: Path) -> None:
 
 
 def every_nth(frames: Sequence[str], number: int) -> set[str]:
-    """Return every `number`-th of the frames, which becomes a query; none if it is 0.
-
-    Raises:
-        ManifestError: there are fewer frames.
+    """Return every `number`-th of the frames, which becomes a query; none if it is 0. Raise ManifestError if there are
+    fewer.
     """
     if number > len(frames):
         raise ManifestError(f"hold-out: found {number}, but there are {len(frames)} frames. Give a smaller number.")
@@ -719,13 +709,10 @@ def every_nth(frames: Sequence[str], number: int) -> set[str]:
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES, draft: Draft | None = None) -> list[str]:
-    """Return the images in and below a folder, sorted by path. Links to folders elsewhere are followed, each once.
+    """Return the images in and below a folder, sorted by path, see `walk_files`; raise CaptureError if there is none.
 
-    Sessions that an import has made are skipped, masks (see `images.find_mask`), and names that are not Unicode. The
-    draft gets the files that are left out, by the reason.
-
-    Raises:
-        CaptureError: there is no image.
+    Masks are skipped (see `images.find_mask`), and names that are not Unicode. The draft gets the files that are left
+    out, by the reason.
     """
     files, captures = walk_files(folder)
     names = sorted((name for name in files if name.lower().endswith(suffixes) and not _is_mask(name)), key=Path)

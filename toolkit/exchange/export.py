@@ -106,11 +106,7 @@ def only_features(files: SceneFiles, session_id: str, kind: str) -> Path:
 def colmap_model(
     local_map: LocalMap, session: Session, keypoints: Keypoints, names: str = "own"
 ) -> pycolmap.Reconstruction:
-    """Return a map as a COLMAP model; the map's observations index the keypoints (n, 2) of each image.
-
-    Raises:
-        ArtifactError: an image of the map is not in the session.
-    """
+    """Return a map as a COLMAP model; the map's observations index the keypoints (n, 2) of each image."""
     row_of = session.row_of_name
     missing = [name for name in local_map.image_names if name not in row_of]
     if missing:
@@ -205,11 +201,9 @@ def export_pairs(
 ) -> int:  # fmt: skip
     """Write the retrieval of a pair in hloc's format, `query reference` per line, and return the number of lines.
 
-    Queries have `topk` references; None: all retrieved ones.
-
-    Raises:
-        ArtifactError: the run has no such retrieval, it is of older vectors, a line of it is malformed, a name contains
-            a space, or a query and a reference have the same name.
+    Queries have `topk` references; None: all retrieved ones. Raise ArtifactError if the run has no such retrieval, it
+    is of older vectors, a line of it is malformed, a name contains a space, or a query and a reference have the same
+    name.
     """
     _require_names(names)
     path = SceneFiles(Path(run), scene).retrieval(map_device, query_device)
@@ -236,11 +230,8 @@ def export_poses(
 
     Poses are cam_from_world in the unit of the capture; a rig has one line per camera. Queries without a pose are left
     out. Names are complete paths; `file`: file names only, as hloc and visuallocalization.net have them. Return the
-    number of lines.
-
-    Raises:
-        ArtifactError: the run has no such poses, they are of older references or of an older map, or a name contains a
-            space.
+    number of lines. Raise ArtifactError if the run has no such poses, they are of older references or of an older map,
+    or a name contains a space.
     """
     _require_names(names)
     path = _require_poses(SceneFiles(Path(run), scene).poses_txt(map_device, query_device))

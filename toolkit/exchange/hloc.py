@@ -39,8 +39,7 @@ _HALF_PIXEL = np.float32(0.5)
 def export_features(run: str | Path, scene: str, session: str, out: str | Path, kind: str = "sift") -> int:
     """Write the features of a session, such as `ios_map`, as a file of hloc, and return the number of images.
 
-    Raises:
-        ArtifactError: the run has no such features, or several.
+    Raise ArtifactError if the run has no such features, or several.
     """
     store = FeatureStore.open(only_features(SceneFiles(Path(run), scene), session, kind))
     write_groups(Path(out), ((name, _to_hloc(store[name])) for name in store), {PIXEL_CENTER: 0.0})
@@ -63,8 +62,7 @@ def _to_hloc(features: LocalFeatures) -> dict[str, NDArray[Any]]:
 def import_features(path: str | Path, out: str | Path) -> FeatureStore:
     """Copy a file of features, by hloc or `export_features`, to a folder, and return its content.
 
-    Raises:
-        ArtifactError: the file is missing, torn, or has no features in the layout of hloc.
+    Raise ArtifactError if the file is missing, torn, or has no features in the layout of hloc.
     """
     path, made_from = Path(path), files_fingerprint([Path(path)])
     with _opened(path) as file, Items(out, {"name": "hloc"}) as items:
@@ -102,13 +100,9 @@ def export_matches(
 ) -> int:  # fmt: skip
     """Write the matches of two sessions as a file of hloc, and return the number of pairs.
 
-    Args:
-        session0, session1: such as `ios_query` and `ios_map`; twice the same for the pairs of a map.
-        capture: new folder of a capture that has moved; needed for the pairs of a map.
-
-    Raises:
-        ArtifactError: the run has no such matches, those of several settings or of older features, or pairs that hloc
-            cannot tell apart.
+    Sessions are such as `ios_query` and `ios_map`; twice the same for the pairs of a map, whose `capture` may have
+    moved. Raise ArtifactError if the run has no such matches, those of several settings or of older features, or pairs
+    that hloc cannot tell apart.
     """
     files = SceneFiles(Path(run), scene)
     folder = files.maps / f"{session0}-{session1}"
@@ -157,8 +151,7 @@ def _matches_to_hloc(matches: PairMatches, count: int) -> dict[str, NDArray[Any]
 def import_matches(path: str | Path, pairs: Iterable[tuple[str, str]], out: str | Path) -> MatchStore:
     """Copy matches of pairs of images, by name in either order, from a file of hloc to a folder; return its content.
 
-    Raises:
-        ArtifactError: the file is missing, torn or of another layout, or lacks a pair.
+    Raise ArtifactError if the file is missing, torn or of another layout, or lacks a pair.
     """
     path, made_from = Path(path), files_fingerprint([Path(path)])
     with _opened(path) as file, Items(out, {"name": "hloc"}) as items:

@@ -233,10 +233,7 @@ def import_once(
 def once(session: Path, inputs: Mapping[str, Any], make: Callable[[dict[str, Any]], ImportReport]) -> str:
     """Make a session, unless it was made before from the same inputs. Return a message for the user.
 
-    `make` takes what `proc/import.json` is to have, see `drafts.Options`.
-
-    Raises:
-        CaptureError: the session was made from other inputs; names them.
+    `make` takes what `proc/import.json` is to have, see `drafts.Options`. Raise CaptureError for other inputs.
     """
     if not session.exists():
         return make({"input": dict(inputs)}).text()
@@ -311,7 +308,7 @@ def camera_at(where: object, params: str) -> pycolmap.Camera:
 def _camera_of(
     row: Mapping[Any, Any], by_id: Mapping[str, pycolmap.Camera | str], shared: pycolmap.Camera | None, path: Path,
     where: str,
-) -> tuple[pycolmap.Camera | str, str]:
+) -> tuple[pycolmap.Camera | str, str]:  # fmt: skip
     """Return the camera of an image and its origin: the table, cameras.txt, the camera shared by all images, or EXIF.
 
     The camera may be why it cannot be used. `where` names file and line of the image's row, for messages.
@@ -382,9 +379,8 @@ def read_poses(table: Path, poses_are: str) -> tuple[list[str], dict[str, Floats
 
 
 def _read_table(path: Path) -> pd.DataFrame:
-    """Read the table of a folder of images, all values as text, with the additional column `line`.
-
-    With poses, column `problem` says why the pose of a row is none.
+    """Read the table of a folder of images, all values as text, with the additional column `line`; with poses, also
+    column `problem`, why the pose of a row is none.
     """
     if _is_transforms(path):
         raise CaptureError(f"{path}: not a CSV table. Import it by {COMMAND} import transforms.")

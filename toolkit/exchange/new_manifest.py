@@ -20,12 +20,8 @@ def new_manifest(
     name: str, capture: str | Path | None = None, folder: str | Path = "data_manifests",
     thresholds: Sequence[tuple[float, float]] = (),
 ) -> Path:  # fmt: skip
-    """Write `<folder>/<name>.yaml` and return its path.
-
-    Args:
-        name: name of the manifest and of its run.
-        capture: capture folder; None: keep the template's placeholder, for the user to fill in.
-        thresholds: of recall, degrees and meters; empty: those of the template.
+    """Write `<folder>/<name>.yaml` and return its path. Without a capture, it keeps the template's placeholder; without
+    `thresholds`, degrees and meters, those of the template.
 
     Raises:
         ManifestError: an invalid name, the file exists already, or there is no template.

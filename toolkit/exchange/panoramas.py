@@ -101,8 +101,7 @@ def _rig_from_views() -> Iterator[tuple[int, Floats]]:
 def _cut(path: Path, out: Path, masks: Path | None) -> int:
     """Write the views of a panorama, and of its mask, to a folder; return their side in pixels.
 
-    Raises:
-        ImageError: the picture or its mask cannot be read, or does not show the whole sphere.
+    Raise ImageError if the picture or its mask cannot be read, or does not show the whole sphere.
     """
     pixels = read_image(path)
     height, width = pixels.shape[:2]

@@ -148,10 +148,7 @@ def open_captures(
 ) -> Iterator[Callable[[str], Capture]]:
     """Yield a function that opens a scene's capture, with the kinds of devices and the links of the runs' manifests.
 
-    Captures that have moved since the runs are in the `given` folders, which have the names of scenes.
-
-    Raises:
-        ManifestError: a given folder has another name.
+    Captures that have moved since are in the `given` folders, which have the names of scenes, else raise ManifestError.
     """
     folders, devices, outside = dict[str, Path](), [], False
     for run in runs:
@@ -234,9 +231,8 @@ def _read_poses(path: Path) -> Trajectory:
 
 
 def _nearest_references(path: Path) -> tuple[dict[Key, Floats], str]:
-    """Return world_from_device (4, 4) of queries from their best reference, and why other queries have none.
-
-    Of all cameras of a query, take the one whose first reference has the best score, and give it that reference's pose.
+    """Return world_from_device (4, 4) of queries from their best reference, and why other queries have none: of all
+    cameras, the one whose first reference has the best score.
     """
     if not path.is_file():
         return {}, f"no retrieval to fill it from: {path} is missing"

@@ -117,10 +117,8 @@ def _named(content: Mapping[str, Any], *keys: str) -> set[str]:
 
 
 def _applied(path: Path, content: Mapping[str, Any]) -> tuple[Floats, float]:
-    """Return applied_transform (4, 4) and applied_scale; the identity and 1 if they are missing.
-
-    Raises:
-        CaptureError: they are not a rigid motion and a positive number.
+    """Return applied_transform (4, 4), a rigid motion, and applied_scale, above 0; the identity and 1 if they are
+    missing.
     """
     scale, rows = content.get("applied_scale", 1.0), content.get("applied_transform", np.eye(4))
     try:

@@ -118,28 +118,17 @@ KINDS: dict[str, FeatureKind] = {
 
 
 def feature_kind(name: str) -> FeatureKind:
-    """Return the entry of `KINDS` with a name.
-
-    Raises:
-        ManifestError: unknown name.
-    """
+    """Return the entry of `KINDS` with a name. Raise ManifestError for an unknown name."""
     if name not in KINDS:
         raise ManifestError(f"Unknown local features {name!r}. {nearest(name, [*KINDS, AUTO])}")
     return KINDS[name]
 
 
 def create_extractor(name: str, settings: FeaturesSettings, device: str = "auto", dtype: str = "auto") -> Extractor:
-    """Return a ready extractor.
+    """Return a ready extractor of the kind `name`, a key of `KINDS`; `settings` are those of all kinds, by name.
 
-    Args:
-        name: a key of `KINDS`.
-        settings: settings of all kinds, each under its name.
-        device: device of a network: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
-        dtype: precision of a network: `auto`, `float32`, `bfloat16`, `float16`.
-
-    Raises:
-        ManifestError: unknown features.
-        WeightsError: the network has no weights.
+    Device and precision of a network: see `models.compute`. Raise ManifestError for an unknown kind, WeightsError for a
+    network without weights.
     """
     make, own = resolve_name(feature_kind(name).extractor), getattr(settings, name, None)
     network = checkpoint_of(settings.checkpoint, name), device, dtype

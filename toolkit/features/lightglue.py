@@ -42,13 +42,11 @@ class LightGlueMatcher(Remade):
         min_score: float = 0.1,
         features: str = "superpoint",
     ) -> None:
-        """
-        Args:
-            checkpoint, device: see `NetworkExtractor`; the file is one of the authors or of the hub.
-            dtype: precision of the attention blocks, see `resolve_precision`.
-            batch_size: largest number of pairs per batch; None: depends on the device.
-            min_score: smallest confidence of a match, from 0 to 1.
-            features: kind of the features, `superpoint` or `aliked`.
+        """Take the authors' or the hub's file, see `NetworkExtractor`, for features of the kind `superpoint` or
+        `aliked`.
+
+        `dtype` is the precision of the attention blocks, `batch_size` the largest number of pairs per batch (None:
+        depends on the device), `min_score` the smallest confidence of a match, from 0 to 1.
 
         Raises:
             WeightsError: the weights are missing, or are those of another network.
@@ -153,9 +151,8 @@ class LightGlueMatcher(Remade):
     def _forward(self, batch: Tensor) -> Tensor:
         """Return for each feature of the first image its partner (-1: none) and the confidence, (B, N, 2).
 
-        Args:
-            batch: (B, 2, N, 2 + DIM + 1): for each image of a pair the normalized x y, the state of the network, and 1;
-                padded with rows of zeros.
+        The batch (B, 2, N, 2 + DIM + 1) has, for each image of a pair, the normalized x y, the state of the network,
+        and 1; padded with rows of zeros.
         """
         return self._forward_pairs(*batch.unbind(1))
 

@@ -67,16 +67,9 @@ MATCHER_WEIGHTS: dict[tuple[str, str], WeightsSource] = {
 
 
 def create_matcher(name: str, **options: Any) -> Matcher:
-    """Return a ready matcher.
+    """Return the matcher of a key of `MATCHERS`; `ratio` and `min_score` are for `mutual`, other options for networks.
 
-    Args:
-        name: a key of `MATCHERS`.
-        options: arguments of the matcher: `ratio` and `min_score` for `mutual`; `checkpoint`, `device`, `dtype`,
-            `features` and others for a network.
-
-    Raises:
-        ManifestError: unknown matcher.
-        WeightsError: the network has no weights.
+    Raise ManifestError for an unknown matcher, WeightsError for a network without weights.
     """
     if name not in MATCHERS:
         raise ManifestError(f"Unknown matcher {name!r}. {nearest(name, MATCHERS)}")
@@ -87,8 +80,7 @@ def create_matcher(name: str, **options: Any) -> Matcher:
 def matchers_of(features: Sequence[str], matcher: str | None = None) -> dict[str, str]:
     """Return the matcher of each kind of features: `matcher` if it suits the kind, else the default of the kind.
 
-    Raises:
-        ManifestError: unknown features, or a matcher that suits none of them.
+    Raise ManifestError for unknown features, or a matcher that suits none of them.
     """
     suited = {name: feature_types.feature_kind(name).matchers for name in features}
     if matcher is not None and matcher not in MATCHERS:
@@ -100,13 +92,8 @@ def matchers_of(features: Sequence[str], matcher: str | None = None) -> dict[str
 
 
 def local_weights(settings: LocalizeSettings | RerankSettings) -> list[tuple[WeightsSource, str | None]]:
-    """Return the weights that the extractors and matchers of these settings need, and the checkpoint given for each.
-
-    Args:
-        settings: of the stage, `auto` resolved.
-
-    Raises:
-        ManifestError: unknown features, or a matcher that suits none of them.
+    """Return the weights that the extractors and matchers of these settings, `auto` resolved, need, and the checkpoint
+    given for each. Raise ManifestError as `matchers_of`.
     """
     features, matcher = settings.features, settings.matcher
     extractors = {"superpoint": weights.SUPERPOINT, "aliked": weights.ALIKED[features.aliked.model]}
@@ -141,11 +128,7 @@ def _auto_kinds(settings: LocalizeSettings | RerankSettings) -> dict[str, list[s
 
 
 def weights_files(settings: LocalizeSettings) -> list[Path]:
-    """Return the files of all weights that these settings need; download missing ones.
-
-    Raises:
-        WeightsError: a download failed.
-    """
+    """Return the files of all weights that these settings need; download missing ones, or raise WeightsError."""
     return [weights.resolve_weights(source, checkpoint) for source, checkpoint in local_weights(settings)]
 
 
@@ -222,13 +205,8 @@ def create_local_methods(
 ) -> list[LocalMethod]:
     """Return kinds of local features with extractors and matchers ready; `mutual` uses the limits of the kind.
 
-    Args:
-        settings: of the stage, `auto` resolved.
-        kinds: None: `settings.features.kinds`.
-
-    Raises:
-        ManifestError: a matcher that suits none of the features.
-        WeightsError: a network has no weights.
+    `settings` have `auto` resolved; `kinds` are theirs by default. Raise ManifestError for a matcher that suits none,
+    WeightsError for a network without weights.
     """
     device, dtype, methods = settings.compute_device, settings.dtype_compute, []
     matchers = matchers_of([*settings.features.kinds, *settings.features.escalation], settings.matcher.name)
@@ -248,10 +226,8 @@ AnyMethod = LocalMethod | DeferredMethod
 
 
 def unit_descriptors(descriptors: Descriptors, shorten: Shorten | None = None) -> NDArray[np.float32]:
-    """Return the descriptors (N, D) of `LocalFeatures` as float32 vectors of length about 1.
-
-    Args:
-        shorten: see `FeatureKind`.
+    """Return the descriptors (N, D) of `LocalFeatures` as float32 vectors of length about 1; for `shorten` see
+    `FeatureKind`.
     """
     unit = descriptors.astype(np.float32, copy=False)
     if descriptors.dtype == np.uint8:

@@ -43,15 +43,12 @@ class NetworkExtractor(Remade):
         batch_size: int | None = None,
         settings: AlikedSettings | SuperPointSettings | None = None,
     ) -> None:
-        """
-        Args:
-            checkpoint: the official file of the network, or its tensors by name; None: take it from an installed
-                package or a cache, or download it.
-            device: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
-            dtype: precision of the encoder: `float32`, `bfloat16`, `float16`; `auto`: float32 on a CPU, else the
-                fastest on the device. Positions, scores and descriptors are always computed in float32.
-            batch_size: largest number of images per batch; None: depends on the device.
-            settings: None: `defaults`.
+        """Take the official file of the network, or its tensors by name; None: an installed package, a cache, or a
+        download.
+
+        `dtype` is the precision of the encoder (`auto`: float32 on a CPU, else the fastest); positions, scores and
+        descriptors are always computed in float32. `batch_size` is the largest number of images per batch; None:
+        depends on the device. `settings` are `defaults` by default.
 
         Raises:
             WeightsError: the weights are missing, or are those of another network.
@@ -82,13 +79,11 @@ class NetworkExtractor(Remade):
         raise NotImplementedError
 
     def _forward(self, batch: Tensor) -> Tensor:
-        """Return x, y, score and descriptor of keypoints, (B, K, 3 + D), strongest first, padded with rows of zeros.
+        """Return x, y, score and descriptor of keypoints, (B, K, 3 + D), strongest first, padded with rows of zeros, of
+        images (B, H, W) or (B, H, W, 3), uint8, in the size of the network's input. The center of the top-left pixel is
+        at 0.
 
-        In x and y, the center of the top-left pixel is at 0. If the scores of an image are not finite, it has a row
-        that is not finite.
-
-        Args:
-            batch: images (B, H, W) or (B, H, W, 3), uint8, in the size of the network's input.
+        If the scores of an image are not finite, it has a row that is not finite.
         """
         raise NotImplementedError
 

@@ -196,14 +196,10 @@ class _Keypoints(NamedTuple):
 
 
 def _extrema(levels: Levels, contrast: float) -> Ints:
-    """Return the local extrema of the difference of Gaussians among all 26 neighbors, as flat indices into `levels`.
+    """Return the extrema of the difference of Gaussians (6, H, W) of an octave among all 26 neighbors, as flat indices.
 
     Absolute values are compared: near the extremum of a smooth function, all values have the same sign. Of equal
-    neighbors, the first is the extremum.
-
-    Args:
-        levels: (6, H, W), of an octave.
-        contrast: of weaker extrema, some are left out already.
+    neighbors, the first is the extremum. Of those weaker than `contrast`, some are left out already.
     """
     _, height, width = levels.shape
     # The interpolated peak, which must reach the contrast, is a little higher than the pixel.
@@ -262,15 +258,10 @@ def _detect(pyramid: _Pyramid, contrast: float) -> _Keypoints:
 
 
 def _parabola(flat: Levels, at: Ints, width: Ints, size: Ints) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Fit a parabola to the difference of Gaussians at N extrema.
+    """Fit a parabola at N extrema, flat indices `at` into the levels of all octaves, rows of `width` and levels of
+    `size`.
 
-    Args:
-        flat: the levels of all octaves, flattened.
-        at: (N,) flat indices of the extrema.
-        width, size: (N,) pixels of a row and of a level at each extremum.
-
-    Returns:
-        Offsets (3, N) of the peaks in x, y and level, their heights (N,), and whether they are on an edge (N,).
+    Return offsets (3, N) of the peaks in x, y and level, their heights (N,), and whether they are on an edge (N,).
     """
 
     def value(offset: Ints | int) -> Floats:
@@ -312,14 +303,10 @@ class _Grid(NamedTuple):
         return cls(np.stack([x.ravel(), y.ravel(), np.ones(x.size, np.float32)], axis=1), step)
 
     def gradients(self, pyramid: _Pyramid, keypoints: _Keypoints, angles: Floats) -> tuple[Floats, Floats]:
-        """Return magnitude (K, N) and direction (K, N), 0 to 2 pi, of the gradients around N keypoints.
+        """Return magnitude (K, N) and direction (K, N), 0 to 2 pi, of the gradients around N keypoints, on grids that
+        are rotated by `angles` (N,), radians.
 
         Gradients are those of the nearest pixels in the keypoint's level; outside the image, the magnitude is 0.
-
-        Args:
-            pyramid: the levels.
-            keypoints: N keypoints.
-            angles: (N,) rotation of the grid, radians.
         """
         height = pyramid.heights[keypoints.octave].astype(np.int32)
         width = pyramid.widths[keypoints.octave].astype(np.int32)

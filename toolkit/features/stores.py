@@ -274,10 +274,8 @@ def _extract(
 
 
 def matches_path(out: str | Path, session0: str, session1: str, made_by: Mapping[str, Any]) -> Path:
-    """Return the folder of the matches of two sessions.
-
-    Args:
-        made_by: settings, `features` (a list with those of each session) and `matcher`.
+    """Return the folder of the matches of two sessions; `made_by` has `features`, a list with those of each, and
+    `matcher`.
     """
     features, matcher = made_by["features"][0].get("name", "features"), made_by["matcher"]["name"]
     return Path(out) / f"{session0}-{session1}" / f"{features}-{matcher}-{fingerprint(made_by)}"
@@ -291,11 +289,8 @@ class MatchStore:
         self._items = Items(path) if items is None else items
 
     def __getitem__(self, names: tuple[str, str]) -> PairMatches:
-        """Return the matches of two images, which the folder may have in either order.
-
-        Raises:
-            KeyError: the folder does not have the pair.
-            DamagedError: the matches are not what was written.
+        """Return the matches of two images, which the folder may have in either order; raise KeyError if it has not,
+        and DamagedError if they are not what was written.
         """
         step = 1 if match_name(*names) in self._items else -1
         arrays = self._items[match_name(*names[::step])]

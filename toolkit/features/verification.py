@@ -42,11 +42,8 @@ class Verifier:
         references: Sequence[str],
         cameras: Sequence[pycolmap.Camera],
     ) -> tuple[list[int], list[int]]:
-        """Return the numbers of verified and of all matches of a query image with each reference.
-
-        Args:
-            features, camera: of the query image.
-            references, cameras: names and cameras of map images; one without features has no matches.
+        """Return the numbers of verified and of all matches of a query image with map images, given by name; 0 without
+        features.
         """
         features, counts = self._strongest(features), np.zeros((2, len(references)), np.int64)
         readable = [index for index, name in enumerate(references) if name in self.store]

@@ -247,11 +247,8 @@ def _digits(value: float) -> str:
 
 
 def reason_in_words(result: QueryResult, numbers: Mapping[str, float], settings: LocalizeSettings) -> str:
-    """Return in a sentence why a query has its status.
-
-    Args:
-        numbers: the known ones of `LABELS`.
-        settings: settings of the localization, which hold the limits.
+    """Return in a sentence why a query has its status; `numbers` are the known ones of `LABELS`, `settings` hold the
+    limits.
     """
     detail, method = result.reason, result.found_by
     if result.status is Status.FAILED:

@@ -104,9 +104,7 @@ def draw_evaluation(evaluation: Evaluation) -> dict[str, "Figure"]:
 def draw_matrices(table: pd.DataFrame, columns: Sequence[tuple[str, str, float, str]], title: str) -> "Figure":
     """Draw map device x query device matrices side by side: shares, blue where high, or errors, orange where high.
 
-    Args:
-        table: one row per pair.
-        columns: for each panel the name of a column, its title, factor and unit; % for shares.
+    For each panel, `columns` has the name of a column of the table, its title, factor and unit; % for shares.
     """
     figure = new_figure(3.1 * len(columns) + 0.4, 3.35)
     maps, queries = (in_order(table[c]) for c in ("map_device", "query_device"))

@@ -71,11 +71,7 @@ def _odometry(session: Session) -> str:
 
 
 def list_poses(path: str | Path) -> pd.DataFrame:
-    """Return image, status and world_from_device of the queries of a pair, as in its files; NaN without a pose.
-
-    Args:
-        path: the pair's `.csv`.
-    """
+    """Return image, status and world_from_device of the queries in a pair's `.csv`; NaN without a pose."""
     results = PairResults.open(path)
     table, poses = results.table, results.poses
     rows = np.full((len(table), len(POSE_NAMES)), np.nan)
@@ -84,10 +80,8 @@ def list_poses(path: str | Path) -> pd.DataFrame:
 
 
 def list_unsure(paths: Iterable[str | Path]) -> pd.DataFrame:
-    """Return the queries whose pose is not `ok`: query and map device, image, status with its reason, and inliers.
-
-    Args:
-        paths: poses of each pair, as for `draw_statuses`.
+    """Return the queries of pairs, `.csv` each, whose pose is not `ok`: devices, image, status with its reason,
+    inliers.
     """
     tables = []
     for results in map(PairResults.open, paths):
@@ -117,13 +111,10 @@ def draw_top_view(
     capture: Capture, up: ArrayLike | None = None, unit: str | None = "auto", points: Floats | None = None,
     colors: NDArray[np.uint8] | None = None,
 ) -> "Figure":  # fmt: skip
-    """Draw all camera centers from above, those of queries only with ground truth; return the figure.
+    """Draw all camera centers from above, those of queries only with ground truth; places far apart get panels.
 
-    Args:
-        capture: the capture; places far apart get panels of their own.
-        up: up direction (3,); None: estimated from the cameras.
-        unit: unit of the poses, None if unknown; `auto`: that of the capture.
-        points, colors: points of the scene (P, 3) and their RGB (P, 3), to draw, too.
+    The up direction (3,) is estimated from the cameras by default, the unit is the capture's. Points (P, 3) of the
+    scene and their RGB (P, 3) are drawn, too.
     """
     layers = []
     for session in _usable(capture):
@@ -145,13 +136,9 @@ def draw_top_view(
 
 @styled
 def draw_similarity(embeddings: str | Path, limit: int = 300) -> "Figure":
-    """Draw the cosine similarity of a query session's images to another device's map; return the figure.
+    """Draw the similarity of a query session's images to another device's map, fused if there are several descriptors.
 
-    With several descriptors, the similarities are fused as for retrieval.
-
-    Args:
-        embeddings: folder of the descriptors, `<device>_<split>/<subsession>/<subsession>.npy`.
-        limit: largest number of images per session, evenly spread.
+    Sessions are thinned evenly to at most `limit` images.
     """
     from toolkit.embedders.search import fuse  # loads FAISS
 
@@ -174,11 +161,7 @@ def draw_similarity(embeddings: str | Path, limit: int = 300) -> "Figure":
 
 @styled
 def draw_references(sessions_root: str | Path, jsonl: str | Path, samples: int = 4, references: int = 4) -> "Figure":
-    """Draw some query images of a pair, each beside its first references; return the figure.
-
-    Args:
-        jsonl: the retrieval of a pair, `<scene>_map_<M>_query_<Q>.jsonl`.
-    """
+    """Draw some query images of a pair's retrieval, a `.jsonl`, each beside its first references; return the figure."""
     lines = read_references(jsonl)
     chosen = np.unique(np.linspace(0, len(lines) - 1, min(samples, len(lines))).round().astype(int))
     return _draw_rows(sessions_root, jsonl, [[lines[row]] for row in chosen], references)
@@ -190,12 +173,7 @@ def draw_reranked(
 ) -> "Figure":
     """Draw query images, each with its first references before and (to the right) after reranking; return the figure.
 
-    The queries drawn are those whose new first reference had the worst retrieval rank.
-
-    Args:
-        jsonl: the reranked references of a pair, `<scene>_map_<M>_query_<Q>.jsonl`.
-        retrieved: the references of the retrieval stage.
-        references: number of references shown per query, before and after.
+    They are those whose new first reference had the worst rank in `retrieved`, the references before.
     """
     before, after = read_references(retrieved), read_references(jsonl)
     moved = [-row["topk"][0]["retrieval_rank"] if row["topk"] else 0 for row in after]
@@ -229,11 +207,7 @@ def _draw_rows(
 
 @styled
 def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
-    """Draw the number of inliers of each query, by pair and status; return the figure.
-
-    Args:
-        paths: poses of each pair, `<scene>_map_<M>_query_<Q>.txt` or `.csv`.
-    """
+    """Draw the number of inliers of each query, by pair (`.txt` or `.csv` each) and status; return the figure."""
     tables = {results.devices: results.table for results in map(PairResults.open, paths)}
     figure = new_figure(8, 0.35 * len(tables) + 1.2)
     plot = figure.subplots()

@@ -27,10 +27,7 @@ def draw_prediction(
 ) -> "Figure":
     """Draw one query image with its references, and the predicted cameras in the map; return the figure.
 
-    Args:
-        query, answer: a query device and its answer.
-        camera: number of its image to draw; None: the first with the most consistent references.
-        up: up direction (3,); None: estimated from the map's cameras.
+    By default, it is the image with the most consistent references, and up is estimated from the map's cameras.
     """
     if camera is None:
         counts = [0 if result.alignment is None else result.alignment.num_inliers for result in answer.cameras]

@@ -43,10 +43,8 @@ def shown_name(name: str, most: int = 1000) -> str:
 def query_and_references(
     figure: "Figure | SubFigure", count: int, rows: int, query_ratio: float, widest: float
 ) -> tuple["Axes", list["Axes"]]:
-    """Return axes of a query, and of its references in some rows to the right, which are as high together.
-
-    Args:
-        query_ratio, widest: width by height of the query, and of the widest reference.
+    """Return axes of a query, and of its references in some rows to the right, which are as high together; the ratios
+    are width by height of the query, and of the widest reference.
     """
     columns = -(-count // rows)
     grid = figure.add_gridspec(rows, 1 + columns, width_ratios=[query_ratio, *[widest / rows] * columns])
@@ -101,10 +99,8 @@ def draw_matches(
 ) -> None:
     """Draw the keypoints of an image: those that agree with the pose, and those of rejected matches.
 
-    Args:
-        by_kind: whether colors and markers tell how matches were found; else those that agree are green.
-        only: (n,) the keypoints to draw; True: all.
-        at: (n, 2) where they are drawn; None: at their pixels.
+    With `by_kind`, colors and markers tell how matches were found; else those that agree are green. Only some, (n,),
+    are drawn, or all; `at` (n, 2), or at their pixels.
     """
     kinds = image.found_by if by_kind else np.full(len(image.pixels), "")
     for agrees in (False, True):
@@ -116,11 +112,9 @@ def draw_matches(
 
 
 def draw_joined(axis: "Axes", query: QueryDetails, inches: float, by_kind: bool = False) -> None:
-    """Draw the first image of a query and its best reference at one height, and join their common points.
+    """Draw the first image of a query and its best reference, `inches` high, and join their common points.
 
-    Args:
-        inches: height in the figure.
-        by_kind: see `draw_matches`; the query then also has the keypoints that the reference does not see.
+    With `by_kind`, see `draw_matches`, the query also has the keypoints that the reference does not see.
     """
     image, height = query.cameras[0], query.cameras[0].camera.height
     end = draw_image(axis, image, inches)
@@ -159,12 +153,7 @@ def draw_pair(query: ShownImage, reference: ShownImage, title: str) -> "Figure":
 def draw_query_and_references(
     images: Sequence[Path | NDArray[np.uint8]], references: Sequence[Sequence[tuple[Path, float]]]
 ) -> "Figure":
-    """Draw the images of a query, one per row, each beside its references, with their ranks and scores.
-
-    Args:
-        images: files or pixels.
-        references: file and score of the references of each image, best first; at most `MAX_SHOWN` are drawn.
-    """
+    """Draw the images of a query, files or pixels, in rows, each beside its references: file and score, best first."""
     shown_rows = [found[:MAX_SHOWN] for found in references]
     columns = max([len(found) for found in shown_rows], default=0)
     figure = new_figure(13, 1.75 * len(images))
@@ -198,12 +187,8 @@ def draw_localization(query: QueryDetails, title: str = "", unit: tuple[str, flo
 
     Green dots are the projections of map points that agree with the pose; a white line joins each to its measured
     keypoint. Orange dots are keypoints of rejected matches. The references have the same colors. A pose without matches
-    is shown with the references that it was computed from, and those that were rejected.
-
-    Args:
-        query: the query; its first image is drawn.
-        title: title of the figure; if the true pose is known, the errors are appended.
-        unit: unit that lengths are shown in, see `metrics.length_unit`.
+    is shown with the references that it was computed from, and those that were rejected. If the true pose is known, the
+    errors follow the title.
     """
     query = query.of_first_camera()
     shown, references = query.cameras[0], query.captioned_references()

@@ -96,16 +96,11 @@ class RetrievedPair:
         map_dir: str | Path | None = None,
         poses_dir: str | Path | None = None,
     ) -> None:
-        """
-        Args:
-            sessions_root: `<capture>/sessions`.
-            jsonl: references of the pair, `<scene>_map_<M>_query_<Q>.jsonl`.
-            embeddings: folder of the descriptors.
-            map_dir, poses_dir: folders of the triangulated maps, and of the poses, which record the maps that were
-                used. None, or without files yet: overlap is computed without map points.
+        """Open the references of a pair, `<scene>_map_<M>_query_<Q>.jsonl`, with the descriptors in the folder
+        `embeddings`.
 
-        Raises:
-            ArtifactError: the references are missing, damaged, or older than the embeddings.
+        Overlap is computed with the map points in `map_dir`, of the maps that the records in `poses_dir` name, if any.
+        Raise ArtifactError if the references are missing, damaged, or older than the embeddings.
         """
         capture = Capture.from_sessions_root(sessions_root)
         jsonl = Path(jsonl)
@@ -119,15 +114,12 @@ class RetrievedPair:
         """Names of the query images."""
 
     def look(self, query: int | str = 0) -> RetrievedQuery:
-        """Return the retrieval of a query image.
+        """Return the retrieval of a query image, by its number, its name, or a unique end of the name.
 
         A map image overlaps with the query if at least `MIN_OVERLAP` of the map points that it observes lie in the
-        query's view at the true pose (`metrics.overlap_in_view`). Without a triangulated map, points at 2, 4, 8 and
-        16 m in the map image's view replace the map points; these ignore walls. Without a true pose, overlap is NaN.
+        query's view at the true pose (`metrics.overlap_in_view`). Without a triangulated map, points at 2, 4, 8 and 16
+        m in the map image's view replace the map points; these ignore walls. Without a true pose, overlap is NaN.
         Similarities are computed from the stored descriptors.
-
-        Args:
-            query: its number, its name, or a unique end of the name.
 
         Raises:
             ArtifactError: no query matches, or several do (the nearest is named), or its descriptors are missing.
@@ -226,9 +218,7 @@ def draw_retrieved(query: RetrievedQuery) -> "Figure":
     return figure
 
 
-def _draw_along(
-    axis: "Axes", query: RetrievedQuery, good: NDArray[np.bool_], retrieved: NDArray[np.bool_]
-) -> None:
+def _draw_along(axis: "Axes", query: RetrievedQuery, good: NDArray[np.bool_], retrieved: NDArray[np.bool_]) -> None:
     """Draw the similarity of the query to the map images, in the order that they were taken."""
     x = np.arange(len(query.images))
     if query.is_known:

@@ -46,14 +46,10 @@ class Eye:
 
     @classmethod
     def of(cls, poses: Floats, up: Floats, others: Sequence[Floats] = ()) -> "Eye":
-        """Return an eye behind and above the first other camera in the map, or else the place with the most cameras.
+        """Return an eye behind and above the first other camera (4, 4) in the map, or else the place with the most
+        cameras.
 
         A camera far from the map, such as the true one of a query of elsewhere, would be all that is seen.
-
-        Args:
-            poses: world_from_cam (N, 4, 4) of the map, at least one.
-            up: up direction (3,) of any length.
-            others: world_from_cam (4, 4).
         """
         up, place = unit(up), places_of(poses[:, :3, 3])
         here = poses[place == np.bincount(place).argmax()]

@@ -102,16 +102,8 @@ class SequencePair:
         return tracks
 
     def changes(self, keys: pd.DataFrame, truth: Trajectory | Floats, limit: Threshold, length: float) -> pd.DataFrame:
-        """Return the queries for which just one pose, the single or the sequence one, is within a threshold.
-
-        Args:
-            keys: the queries, columns timestamp and device_id.
-            truth: their true poses.
-            limit: threshold, degrees and lengths.
-            length: the unit of lengths, in the unit of the poses.
-
-        Returns:
-            timestamp, device_id, change (`rescued` or `broken`), and the errors of both poses.
+        """Return the queries for which just one pose, the single or the sequence one, is within a threshold: timestamp,
+        device_id, change (`rescued` or `broken`), and the errors of both poses, in lengths of `length`.
         """
         table, within = keys[_KEY].copy(), list[NDArray[np.bool_]]()
         for step, prefix in ((SINGLE, "single_"), (SEQUENCE, "")):
@@ -152,11 +144,6 @@ def draw_sequence(
     """Draw a pair's recordings from above: odometry before and after, and the single queries; return the figure.
 
     With ground truth, queries that the sequence rescued or broke (5 degrees, 0.5 m) are marked.
-
-    Args:
-        capture: capture of the map to draw; places far apart get panels of their own.
-        up: up direction (3,); None: estimated from the map's cameras.
-        unit: unit that lengths are shown in, see `metrics.length_unit`.
     """
     map_poses, session = capture[f"{map_device}_map"].world_from_cam(), capture[f"{query_device}_query"]
     map_poses, before, after = map_poses[is_posed(map_poses)], pair.odometry_tracks(session), pair.tracks()
@@ -203,10 +190,8 @@ def _marks(pair: SequencePair, session: Session, length: float) -> dict[str, Flo
 
 @styled
 def draw_steps(table: pd.DataFrame) -> "Figure":
-    """Draw the recall after each step, one panel per threshold: a dot per pair, a bar for their mean.
-
-    Args:
-        table: rows of `SequencePair.recalls` with map_device and query_device.
+    """Draw the recall after each step, of `SequencePair.recalls` of pairs: a panel per threshold, a dot per pair, a bar
+    for their mean.
     """
     columns = [name for name in table.columns if name.startswith("recall@")]
     steps = list(dict.fromkeys(table["step"]))

@@ -50,14 +50,11 @@ class Layer:
         self, at: Floats, label: str | None = None, color: Any = "0.6", heading: float = 0.0, track: bool = False,
         hollow: bool = False, **style: Any,
     ) -> None:  # fmt: skip
-        """
-        Args:
-            at: positions (N, 3) or poses of cameras (N, 4, 4), world; NaN is not drawn.
-            label: text in the legend.
-            color: one color, or an array of one per item.
-            heading: length of the line in a camera's viewing direction, as a share of the panel.
-            track: whether the positions are joined.
-            style: passed to matplotlib's `scatter`, of a track to `plot`.
+        """Take positions (N, 3) or poses of cameras (N, 4, 4), world; NaN is not drawn. The color may be an array, one
+        per item.
+
+        `heading` is the length of the line in a camera's viewing direction, as a share of the panel; positions of a
+        `track` are joined; `style` is passed to matplotlib's `scatter`, of a track to `plot`.
         """
         self.at, self.label, self.color, self.heading = at, label, color, heading
         self.track, self.hollow, self.style = track, hollow, style
@@ -113,11 +110,8 @@ class Places:
 
 
 def window_of(xy: Floats, margin: float = 0.07, longest: float = 1.0) -> Floats:
-    """Return a window, low and high corner (2, 2), around positions (N, 2).
-
-    Args:
-        margin: share of their extent that is added on each side.
-        longest: limit of the ratio of its sides; 1: a square.
+    """Return a window, low and high corner (2, 2), around positions (N, 2), with a margin, a share of their extent, on
+    each side, and a ratio of its sides of at most `longest`; 1: a square.
     """
     xy = xy if len(xy) else np.zeros((1, 2))
     half = (0.5 + margin) * np.ptp(xy, axis=0)
@@ -129,14 +123,8 @@ def window_of(xy: Floats, margin: float = 0.07, longest: float = 1.0) -> Floats:
 def draw_places(
     ground: Ground, layers: Sequence[Layer], cameras: Floats, cloud: Floats | None = None, others: Floats | None = None
 ) -> tuple["Figure", Places, list[tuple["Axes", int, Floats]]]:
-    """Draw layers, one panel per place.
-
-    Args:
-        cameras: (N, 3) or (N, 4, 4), which make the places.
-        cloud, others: see `Places.contents`, (N, 3) or (N, 4, 4).
-
-    Returns:
-        The figure, the places, and each panel with the number and the window of its place.
+    """Draw layers, one panel per place that `cameras`, (N, 3) or (N, 4, 4), make; for `cloud` and `others` see
+    `Places.contents`. Return the figure, the places, and each panel with the number and the window of its place.
     """
     none = np.zeros((0, 3))
     places = Places(ground.flat(cameras))
@@ -178,15 +166,9 @@ def draw_scene(
     """Draw the map from above with estimated and true query poses, one panel per place; return the figure.
 
     Args:
-        points: (P, 3), meters.
-        colors: (P, 3) RGB, or None.
-        map_poses: world_from_cam (N, 4, 4) of the map; NaN rows are skipped.
-        estimated: world_from_cam (Q, 4, 4) of the queries, NaN without a pose.
-        true: true world_from_cam (Q, 4, 4) of the queries, NaN where unknown.
-        up: up direction (3,); None: estimated from the map's cameras.
-        map_tracks: tracks of the map devices, (n, 3) each, drawn as lines.
-        query_tracks: true tracks of the query devices.
-        unit: unit that lengths are shown in, see `metrics.length_unit`.
+        points, colors: (P, 3), meters, and (P, 3) RGB or None.
+        map_poses, estimated, true: world_from_cam (N, 4, 4) of the map, and (Q, 4, 4) of the queries; NaN if unknown.
+        map_tracks, query_tracks: tracks of the map devices and true ones of the query devices, (n, 3) each.
     """
     from matplotlib.collections import LineCollection
 

@@ -66,10 +66,7 @@ def find_manifest(given: str | Path) -> Path:
     """Return the path of a manifest that is given by its path or by its name, such as `demo`.
 
     One that is not here but comes with the toolkit is copied to `data_manifests/` first, with those that it inherits,
-    so that its data and runs are here, too, and a user can see and change it.
-
-    Raises:
-        ManifestError: there is none; names those with a similar name.
+    so that its data and runs are here, too, and a user can see and change it. Raise ManifestError if there is none.
     """
     path, folder = Path(given), Path("data_manifests")
     name = path.name if path.suffix in (".yaml", ".yml") else f"{path.name}.yaml"
@@ -152,10 +149,8 @@ def _read_yaml(path: Path, heir: Path | None = None) -> dict[str, Any]:
 
 
 def _parse_yaml(text: str) -> Any:
-    """Return the content of a YAML text.
-
-    Raises:
-        yaml.YAMLError: the text is not valid, or its aliases expand to too many values or contain themselves.
+    """Return the content of a YAML text; raise yaml.YAMLError for an invalid one, or for aliases that expand to too
+    much.
     """
     loader = yaml.SafeLoader(text)
     try:

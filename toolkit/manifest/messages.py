@@ -28,11 +28,8 @@ def nested_model(annotation: Any) -> type[BaseModel] | None:
 def explain(
     error: ValidationError, model: type[BaseModel], source: str, origin: Callable[[list[str]], str] = lambda keys: ""
 ) -> str:
-    """Return the message of a validation error, one line per problem.
-
-    Args:
-        source: name of the validated file or class, for the first line.
-        origin: maps the keys of a value to a suffix that says where the value comes from.
+    """Return the message of a validation error of the file or class `source`, one line per problem; `origin` maps the
+    keys of a value to a suffix that says where the value comes from.
     """
     lines = list[str]()
     for problem in error.errors():

@@ -74,8 +74,7 @@ class Settings(BaseModel):
     def of(cls, *layers: "Settings | Mapping[str, Any] | None") -> Self:
         """Return the defaults, overridden by the layers in turn; a later layer wins. One whole model stays as it is.
 
-        Raises:
-            ManifestError: a key is unknown or a value is not valid; names the key and what was expected.
+        Raise ManifestError that names an unknown key, or the key of an invalid value and what was expected.
         """
         if len(layers) == 1 and isinstance(layers[0], cls):
             return layers[0]

@@ -77,9 +77,7 @@ class JoinedImages(NamedTuple):
     colors: Callable[[Ints, Ints], NDArray[np.uint8]]  # returns the colors (n, 3) at n keypoints of n images
 
 
-def join_tiles(
-    tiles: Sequence[Tile], load: Callable[[int], LocalMap], images: JoinedImages, folder: Path
-) -> LocalMap:
+def join_tiles(tiles: Sequence[Tile], load: Callable[[int], LocalMap], images: JoinedImages, folder: Path) -> LocalMap:
     """Join the maps of tiles.
 
     Args:

@@ -60,11 +60,7 @@ class Aliked(nn.Module):
 
     @classmethod
     def from_checkpoint(cls, checkpoint: str | Path | Mapping[str, Tensor], model: str = "aliked-n16") -> "Aliked":
-        """Create the network from an official file, or from tensors under the official names.
-
-        Raises:
-            WeightsError: the weights are of another network; names missing, unexpected and mis-shaped keys.
-        """
+        """Create the network from an official file, or tensors under the official names, else raise WeightsError."""
         with torch.device("meta"):
             network = cls(model)
         load_checkpoint(network, checkpoint, model.replace("aliked", "ALIKED"))
@@ -134,9 +130,8 @@ class Aliked(nn.Module):
         return F.normalize(head(sampled.view(*positions.shape[:2], -1)), dim=1)
 
     def _features(self, levels: "Levels", image: int, pixels: Tensor) -> tuple[list[Tensor], Tensor]:
-        """Return the features of one image at whole pixels (N, 2), one (N, D / 4) per level, and their length (N,).
-
-        The authors' map holds the concatenated features, divided by their length.
+        """Return the features of one image at whole pixels (N, 2), one (N, D / 4) per level, and their length (N,), by
+        which the authors' map of all levels is divided.
         """
         fine = levels.fine[image].permute(1, 2, 0)
         x, y = (pixels + torch.tensor(levels.corner, device=pixels.device)).unbind(1)
@@ -164,14 +159,11 @@ class Levels:
 
 
 def find_keypoints(scores: Tensor, most: int, threshold: float = 0.0, radius: int = 2) -> tuple[Tensor, Tensor]:
-    """Return the positions x y (K, 2) and scores (K,) of the maxima of a score map (H, W), highest score first.
+    """Return the positions x y (K, 2) and scores (K,) of at most `most` maxima of a score map (H, W), highest score
+    first.
 
-    Positions have subpixel precision; the center of the top-left pixel is at (0, 0).
-
-    Args:
-        most: largest number of keypoints.
-        threshold: lower bound of the score at a keypoint's pixel, exclusive.
-        radius: smallest distance between the pixels of two keypoints, and from a keypoint's pixel to the border.
+    Positions have subpixel precision; the center of the top-left pixel is at (0, 0). The score at a keypoint's pixel is
+    above the threshold; pixels of two keypoints, and the border, are more than the radius apart.
     """
     height, width = scores.shape
     maxima = _suppress(scores, radius)
@@ -192,9 +184,8 @@ def find_keypoints(scores: Tensor, most: int, threshold: float = 0.0, radius: in
 
 
 def _suppress(scores: Tensor, radius: int) -> Tensor:
-    """Return the scores (H, W) with all but the maxima set to zero.
-
-    Finds the pixels that are the maximum of their window, then twice those among pixels outside of all such windows.
+    """Return the scores (H, W) with all but the maxima set to zero: of the pixels that are the maximum of their window,
+    then twice of those outside of all such windows.
     """
     maxima = scores == _window_max(scores, radius)
     for _ in range(2):
@@ -234,9 +225,8 @@ def _weighted_sum(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
 
 
 def _corners(positions: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Return the indices and weights, both (..., 4), of the four pixels of a map (H, W) around positions (..., 2), x y.
-
-    Indices are into the flattened map.
+    """Return the indices, into the flattened map, and weights, both (..., 4), of the four pixels of a map (H, W) around
+    positions (..., 2), x y.
     """
     axes = []
     for position, length in ((positions[..., 1], shape[0]), (positions[..., 0], shape[1])):

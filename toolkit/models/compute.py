@@ -35,13 +35,9 @@ the settings of torch (`full_float32`, `without_cudnn`, number of threads) that 
 
 
 def resolve_device(name: str = "auto") -> "torch.device":
-    """Return the device named `auto`, `cpu`, `cuda`, `cuda:<i>` or `mps`.
+    """Return the device named `auto` (the first GPU, else Apple's, else the CPU), `cpu`, `cuda`, `cuda:<i>` or `mps`.
 
-    `auto`: the first GPU, else Apple's, else the CPU.
-
-    Raises:
-        ManifestError: unknown name.
-        ToolkitError: torch finds no such device on this machine.
+    Raise ManifestError for an unknown name; ToolkitError if torch finds no such device on this machine.
     """
     import torch
 
@@ -62,13 +58,10 @@ def resolve_device(name: str = "auto") -> "torch.device":
 
 
 def resolve_precision(name: str, device: "torch.device") -> "torch.dtype":
-    """Return the data type in which a network computes.
+    """Return the data type in which a network computes; raise ManifestError for none of `PRECISIONS`.
 
-    `auto`: bfloat16 where the device multiplies it natively (GPUs since Ampere; CPUs with AMX or AVX512-BF16),
-    float16 on older GPUs, else float32.
-
-    Raises:
-        ManifestError: not one of `PRECISIONS`.
+    `auto`: bfloat16 where the device multiplies it natively (GPUs since Ampere; CPUs with AMX or AVX512-BF16), float16
+    on older GPUs, else float32.
     """
     import torch
 
@@ -179,11 +172,7 @@ def upload(batch: "torch.Tensor", device: "torch.device") -> "torch.Tensor":
 
 
 def on_device(model: "torch.nn.Module", device: "torch.device", title: str) -> "torch.nn.Module":
-    """Move a network to a device; `title` is its name, for messages.
-
-    Raises:
-        ToolkitError: its weights do not fit the memory of the device.
-    """
+    """Move a network to a device; raise ToolkitError, with its title, if its weights do not fit the memory there."""
     try:
         return model.to(device)
     except RuntimeError as error:
@@ -252,11 +241,10 @@ class Fitting:
     def __init__(
         self, run: "Callable[[torch.Tensor], torch.Tensor]", what: str, device: "torch.device | None" = None
     ) -> None:
-        """
-        Args:
-            run: maps a tensor (B, ...) to (B, ...), each row independently.
-            what: name of the rows in the plural, for messages.
-            device: where to run; None: the device of the batch.
+        """`run` maps a tensor (B, ...) to (B, ...), each row independently; `what` names the rows in the plural, for
+        messages.
+
+        Without a device, it runs on that of the batch.
         """
         self._run = run
         self._device = device
@@ -264,13 +252,10 @@ class Fitting:
         self._limit: int | None = None
 
     def __call__(self, batch: "torch.Tensor") -> "torch.Tensor":
-        """Return `run(batch)`.
+        """Return `run(batch)`; raise ToolkitError if not even one row fits.
 
-        If the batch does not fit, halves it as often as needed, logs a warning, and remembers the size that fits.
-        Moves the parts of the batch to the device. Computes float32 in full precision, see `full_float32`.
-
-        Raises:
-            ToolkitError: not even one row fits.
+        If the batch does not fit, halves it as often as needed, logs a warning, and remembers the size that fits. Moves
+        the parts of the batch to the device. Computes float32 in full precision, see `full_float32`.
         """
         import torch
 

@@ -94,10 +94,8 @@ class Backbone(Dinov2):
     """
 
     def __init__(self, dim: int, depth: int, num_heads: int, grid: int, alternate_from: int) -> None:
-        """
-        Args:
-            dim, depth, num_heads, grid: see `Dinov2`.
-            alternate_from: number of the first of the later blocks; those with odd numbers attend among views.
+        """`alternate_from` is the first of the later blocks, of which those with odd numbers attend among views; see
+        `Dinov2`.
         """
         super().__init__(dim, depth, num_heads, grid, _NORM_EPS, (alternate_from, _NORM_EPS))
         self.alternate_from = alternate_from
@@ -127,14 +125,11 @@ class Backbone(Dinov2):
         layers: Collection[int],
         cameras_only: bool = False,
     ) -> tuple[dict[int, LayerTokens], Tensor]:
-        """Return the tokens after the given blocks.
+        """Return the tokens after the given blocks, `layers`, which attend among views.
 
         Args:
-            tokens: (B, S, 1 + rows * columns, C) from `encode`.
-            cameras: (B, S, C) camera tokens.
-            rows, columns: rows and columns of patches.
-            layers: numbers of the blocks whose tokens to return; these blocks attend among views.
-            cameras_only: compute and return only the camera tokens of the last of them.
+            tokens, cameras: (B, S, 1 + rows * columns, C) from `encode`, and (B, S, C) camera tokens.
+            cameras_only: compute and return only the camera tokens of the last of the blocks.
 
         Returns:
             By block, the tokens (B, S, T, C) after the preceding block, and the normalized tokens after the block
@@ -166,9 +161,6 @@ def choose_reference(class_tokens: Tensor, way: str) -> Tensor:
     in three measures, each scaled to [0, 1] over the views: the mean cosine similarity to the other views, the length
     of the class token, and the variance of the class token normalized to length 1. (Lin et al., Depth Anything 3,
     2025.)
-
-    Raises:
-        ValueError: unknown way.
     """
     if way not in REFERENCES:
         raise ValueError(f"reference is {way!r}; expected one of {list(REFERENCES)}.")
@@ -292,9 +284,8 @@ class DepthAnything3(MultiView):
         return output
 
     def _camera_tokens(self, tokens: Tensor, reference: str) -> Tensor:
-        """Return the learned camera tokens (B, S, C) for tokens from `encode`.
-
-        The official code also moves the reference view to the front, which changes rounding only.
+        """Return the learned camera tokens (B, S, C) for tokens from `encode`. The official code also moves the
+        reference view to the front, which changes rounding only.
         """
         chosen = choose_reference(tokens[:, :, 0].float(), reference)
         is_reference = torch.arange(tokens.shape[1], device=tokens.device) == chosen[:, None]
@@ -303,9 +294,8 @@ class DepthAnything3(MultiView):
 
 
 def _cameras(pose_enc: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Return `cam_from_world` (B, S, 3, 4) and K (B, S, 3, 3) of pose encodings, with their type and device.
-
-    NaN if an encoding is not finite or its quaternion is zero.
+    """Return `cam_from_world` (B, S, 3, 4) and K (B, S, 3, 3) of pose encodings, with their type and device; NaN if an
+    encoding is not finite or its quaternion is zero.
     """
     encoding = np.asarray(pose_enc.cpu(), np.float64)
     invalid = ~(np.isfinite(encoding).all(axis=-1) & encoding[..., 3:7].any(axis=-1))

@@ -77,14 +77,9 @@ class DenseHead(nn.Module):
     def __init__(
         self, dim: int, out: int, channels: Sequence[int], features: int, patch: int, overwrites: bool
     ) -> None:
-        """
-        Args:
-            dim: channels of the concatenated tokens of both blocks of a layer.
-            out: channels of the result, including the confidence.
-            channels: channels of the maps of the four layers.
-            features: channels of the fused map.
-            patch: side of a patch, pixels.
-            overwrites: see `ResidualUnit`.
+        """`dim` is that of the concatenated tokens of both blocks of a layer, `out` the channels of the result,
+        including the confidence, `channels` those of the maps of the four layers, `features` those of the fused map;
+        for `overwrites` see `ResidualUnit`.
         """
         super().__init__()
         self.patch = patch
@@ -136,15 +131,10 @@ class ConvolutionalHead(DenseHead):
 def dense_output(
     head: DenseHead, layers: Mapping[int, LayerTokens], read: Sequence[int], size: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
-    """Run a dense head on all views, a few at a time.
+    """Run a dense head on all views, a few at a time, from the tokens (B, S, T, C) of the four layers that it reads.
 
-    Args:
-        layers: tokens (B, S, T, C) by layer.
-        read: the four layers that the head reads.
-        size: (H, W) of the images.
-
-    Returns:
-        The values (B, S, H, W, out - 1) before activation, and the confidence (B, S, H, W), above 1.
+    Return the values (B, S, H, W, out - 1) before activation, and the confidence (B, S, H, W), above 1; `size` is (H,
+    W).
     """
     B, S = layers[read[0]][0].shape[:2]
     flat = [(layers[layer][0].flatten(0, 1), layers[layer][1].flatten(0, 1)) for layer in read]

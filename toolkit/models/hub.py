@@ -2,12 +2,7 @@
 
 
 def failure_reason(error: Exception, page: str = "the model's page", url: str = "") -> str:
-    """Return why a request failed, as a phrase.
-
-    Args:
-        page: where users accept the license.
-        url: what was requested; empty: something of the hub.
-    """
+    """Return why a request failed, as a phrase; users accept the license on `page`, and `url` is empty for the hub."""
     from huggingface_hub import constants, errors
 
     status, server = status_of(error), url or constants.ENDPOINT

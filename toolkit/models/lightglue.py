@@ -47,9 +47,8 @@ _NAMES = {
 
 
 def official_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Rename the tensors of a checkpoint, the authors' or one of the package `transformers`, to those of `LightGlue`.
-
-    Unknown names stay unchanged.
+    """Rename the tensors of a checkpoint, the authors' or one of the package `transformers`, to those of `LightGlue`;
+    unknown names stay unchanged.
     """
     renamed = {}
     for name, value in state.items():
@@ -76,11 +75,8 @@ def _rotate(x: Tensor, rope: Rope) -> Tensor:
 
 
 def _attend(queries: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
-    """Return the attention output without scaling: softmax(queries @ keys.T) @ values, (B, N, heads * D).
-
-    Args:
-        queries, keys, values: (B, N, heads, D) for queries, (B, M, heads, D) for keys and values.
-        mask: (B, 1, 1, M), True for real keys; None: all.
+    """Return the attention output without scaling, softmax(queries @ keys.T) @ values, (B, N, heads * D), of queries
+    (B, N, heads, D), keys and values (B, M, heads, D), and a mask (B, 1, 1, M) that is True for real keys, or None.
     """
     q, k, v = (tensor.transpose(1, 2).contiguous() for tensor in (queries, keys, values))
     if mask is not None or not has_onednn(queries):
@@ -207,10 +203,8 @@ class LightGlue(nn.Module):
     def encode(self, keypoints: Tensor, descriptors: Tensor, mask: Tensor | None) -> Tensor:
         """Return features (B, N, DIM), float32, before the first cross-attention. They depend on this image only.
 
-        Args:
-            keypoints: (B, N, 2), from -1 to 1 along the longer side of the image.
-            descriptors: (B, N, input_dim).
-            mask: (B, N), True for real features, False for padding; None: all are real.
+        Keypoints (B, N, 2) are from -1 to 1 along the longer side of the image, descriptors (B, N, input_dim); the mask
+        (B, N) is True for real features, False for padding; None: all are real.
         """
         mask = None if mask is None else mask[:, None, None]
         return self.transformers[0].self_attn(self.input_proj(descriptors), self._rope(keypoints), mask)
@@ -225,9 +219,8 @@ class LightGlue(nn.Module):
         """Return the match of each feature of the first images, -1 for none, and its confidence, each (B, N).
 
         Args:
-            keypoints: of both images, as in `encode`.
-            encoded: features from `encode` of both images, (B, N, DIM) and (B, M, DIM).
-            masks: (B, N) and (B, M), True for real features, at least one per image; None: all are real.
+            keypoints, encoded, masks: of both images, as in `encode` and from it; at least one feature per image
+                is real.
             adaptive: stop early, and drop features that match nothing, as the authors' code does by default. Only for
                 B = 1 without masks.
         """
@@ -266,9 +259,8 @@ class LightGlue(nn.Module):
     def _assign(
         self, a: Tensor, b: Tensor, mask_a: Tensor | None, mask_b: Tensor | None, number: int
     ) -> tuple[Tensor, Tensor]:
-        """Return mutual best matches after a layer, by the sum of the log softmax over rows and over columns.
-
-        See `forward` for the shapes.
+        """Return mutual best matches after a layer, by the sum of the log softmax over rows and over columns; see
+        `forward`.
         """
         layer = self.log_assignment[number]
         scores = layer.final_proj(a) @ (layer.final_proj(b) / DIM**0.5).mT

@@ -109,12 +109,8 @@ class MegaLoc(nn.Module):
         hidden: int = 512,
         out: int = 8448,
     ) -> None:
-        """
-        Args:
-            dim, depth, num_heads: sizes of the transformer.
-            grid: rows and columns of patches for which the position embedding was trained.
-            clusters, cluster_dim, token_dim, hidden: sizes of the aggregation.
-            out: length of the descriptor.
+        """`dim`, `depth`, `num_heads` are sizes of the transformer, whose position embedding was trained for a `grid`
+        of patches; `clusters`, `cluster_dim`, `token_dim`, `hidden` those of the aggregation; `out` of the descriptor.
         """
         super().__init__()
         self.clusters = clusters

@@ -96,9 +96,8 @@ class Loader:
     def load(self, sources: Sequence[Source], mode: str) -> Views:
         """Load images. Blends RGBA with white. Does not apply the EXIF orientation.
 
-        Raises:
-            ImageError: a file is missing or cannot be decoded, or an image is too elongated.
-            ValueError: no images, or an unknown mode.
+        Raise ImageError for a file that cannot be decoded or an elongated image; ValueError for no images or another
+        mode.
         """
         if mode not in self.modes:
             raise ValueError(f"mode is {mode!r}; expected one of {list(self.modes)}.")
@@ -148,16 +147,11 @@ def _open_image(source: Source) -> Image.Image:
 
 
 def cameras_from_pose_encoding(pose_enc: ArrayLike, size: tuple[int, int]) -> tuple[Floats, Floats]:
-    """Return `cam_from_world` (..., 3, 4) and intrinsics K (..., 3, 3), pixels, of pose encodings (..., 9).
+    """Return `cam_from_world` (..., 3, 4) and intrinsics K (..., 3, 3), pixels, of pose encodings (..., 9), an array or
+    a tensor on the CPU, of images of a size (H, W).
 
-    A field of view of 0 gives an infinite focal length; the network returns 0 for negative fields of view.
-
-    Args:
-        pose_enc: (..., 9), an array or a tensor on the CPU.
-        size: (H, W) of the images.
-
-    Raises:
-        ValueError: not 9 numbers, or a quaternion is zero or not finite.
+    A field of view of 0 gives an infinite focal length; the network returns 0 for negative fields of view. Raise
+    ValueError for not 9 numbers, or a quaternion that is zero or not finite.
     """
     encoding = np.asarray(pose_enc, np.float64)
     if encoding.shape[-1:] != (9,):
@@ -217,14 +211,8 @@ class MultiView(nn.Module):
     """The trunk: `patch_embed` encodes patches, `camera_token` is a parameter (..., C)."""
 
     def __init__(self, heads: Sequence[str], compute_dtype: torch.dtype) -> None:
-        """
-        Args:
-            heads: the heads to create, of `known_heads`.
-            compute_dtype: float32 or bfloat16, for the trunk's matrix products and attention. Sums, norms and heads
-                are float32.
-
-        Raises:
-            ValueError: unknown head.
+        """The heads are those to create, of `known_heads`, else raise ValueError; `compute_dtype`, float32 or bfloat16,
+        is for the trunk's matrix products and attention. Sums, norms and heads are float32.
         """
         super().__init__()
         self.heads = _ordered_heads(heads, self.known_heads)

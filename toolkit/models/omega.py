@@ -246,11 +246,8 @@ class VGGTOmega(MultiView):
         dense_channels: Sequence[int] = (256, 512, 1024, 1024),
         dense_features: int = 256,
     ) -> None:
-        """
-        Args:
-            register_layers: layers in which only camera and register tokens attend among views.
-            heads, compute_dtype, dim, depth, num_heads, encoder_depth, encoder_num_heads, camera_depth,
-                camera_num_heads, dense_layers, dense_channels, dense_features: see `VGGT`.
+        """`register_layers` are those in which only camera and register tokens attend among views; for the rest see
+        `VGGT`.
         """
         super().__init__(heads, compute_dtype)
         self.dense_layers = tuple(dense_layers)

@@ -120,13 +120,10 @@ class Aggregator(nn.Module):
     def forward(
         self, patch_tokens: Tensor, rows: int, columns: int, layers: Collection[int], cameras_only: bool = False
     ) -> dict[int, LayerTokens]:
-        """Return the tokens after the given layers.
+        """Return the tokens after the given layers, from 0, of patch tokens (B, S, rows * columns, C) from
+        `patch_embed`.
 
-        Args:
-            patch_tokens: (B, S, rows * columns, C) from `patch_embed`.
-            rows, columns: rows and columns of patches.
-            layers: numbers of the layers whose tokens to return, from 0.
-            cameras_only: compute and return only the camera tokens of the last of them, T = 1.
+        With `cameras_only`, compute and return only the camera tokens of the last of them, T = 1.
 
         Returns:
             By layer, the tokens (B, S, T, C) after each of its two blocks; T = SPECIAL + rows * columns.
@@ -214,15 +211,14 @@ class VGGT(MultiView):
         dense_channels: Sequence[int] = (256, 512, 1024, 1024),
         dense_features: int = 256,
     ) -> None:
-        """
+        """Take the sizes of the network, see `MultiView` for the first two.
+
         Args:
-            heads, compute_dtype: see `MultiView`.
-            dim, depth, num_heads: sizes of the trunk; each of the `depth` layers has two blocks.
-            encoder_depth, encoder_num_heads: sizes of the patch encoder, which has the same `dim`.
+            dim, depth, num_heads: of the trunk; each of the `depth` layers has two blocks.
+            encoder_depth, encoder_num_heads: of the patch encoder, which has the same `dim`.
             grid: rows and columns of patches for which the position embedding was trained.
-            camera_depth, camera_num_heads: sizes of the camera head.
-            dense_layers: the four layers that the dense heads read.
-            dense_channels, dense_features: channels of the dense heads.
+            camera_depth, camera_num_heads: of the camera head.
+            dense_layers, dense_channels, dense_features: the four layers that the dense heads read, and their channels.
         """
         super().__init__(heads, compute_dtype)
         self.dense_layers = tuple(dense_layers)

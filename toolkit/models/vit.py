@@ -66,12 +66,10 @@ class Attention(nn.Module):
     """Self-attention among all tokens of a sequence, (B, N, C) -> (B, N, C)."""
 
     def __init__(self, dim: int, num_heads: int, qk_norm_eps: float | None = None, dinov3: bool = False) -> None:
-        """
-        Args:
-            dim, num_heads: C, and the number of heads.
-            qk_norm_eps: epsilon of a LayerNorm on the queries and keys of each head; None: no LayerNorm.
-            dinov3: as in DINOv3, multiply the bias of queries, keys and values by a mask (0 for keys), and rotate pairs
-                of channels that are half a head apart.
+        """`qk_norm_eps` is the epsilon of a LayerNorm on the queries and keys of each head; None: no LayerNorm.
+
+        `dinov3`: multiply the bias of queries, keys and values by a mask (0 for keys), and rotate pairs of channels
+        that are half a head apart.
         """
         super().__init__()
         self.num_heads = num_heads
@@ -152,12 +150,10 @@ class Block(nn.Module):
         self.ls2 = LayerScale(dim)
 
     def forward(self, x: Tensor, rope: Rope | None = None, kept: Tensor | None = None) -> Tensor:
-        """Return the tokens (B, N, C) after this block.
+        """Return the tokens (B, N, C) after this block, for tokens x (B, N, C) with position embeddings for queries and
+        keys.
 
-        Args:
-            x: (B, N, C).
-            rope: position embedding of each token, for queries and keys.
-            kept: indices of the tokens to return; None: all. The block computes only keys and values of other tokens.
+        Only the tokens with indices `kept` are returned; None: all. Of others, the block computes only keys and values.
         """
         matrix_type = self.attn.qkv.weight.dtype
         stream = x if kept is None else x[:, kept]
@@ -188,12 +184,8 @@ class Dinov2(nn.Module):
         norm_eps: float = 1e-6,
         qk_norms: tuple[int, float] | None = None,
     ) -> None:
-        """
-        Args:
-            dim, depth, num_heads: channels, blocks, and heads of each block.
-            grid: rows and columns of patches for which the position embedding was trained.
-            norm_eps: epsilon of the last norm.
-            qk_norms: the first block that normalizes queries and keys, and the epsilon; None: no block does.
+        """`grid` has the rows and columns of patches for which the position embedding was trained, `norm_eps` is of the
+        last norm; `qk_norms`: the first block that normalizes queries and keys, and the epsilon; None: no block does.
         """
         super().__init__()
         self.grid = grid

@@ -243,11 +243,7 @@ def given_or_resolved(source: WeightsSource, checkpoint: str | Path | Tensors | 
 
 
 def check_weights(source: WeightsSource, path: Path) -> None:
-    """Check that a file is complete and holds the right model, if `source.tensor` tells it from others.
-
-    Raises:
-        WeightsError: it is not complete, or holds another model.
-    """
+    """Raise WeightsError if a file is not complete, or of another model, where `source.tensor` tells it from others."""
     if source.tensor and source.tensor not in (state := read_state_dict(path)):
         raise WeightsError(
             f"{path}: these are not weights of {source.model}: none of {len(state)} tensors is {source.tensor}. "

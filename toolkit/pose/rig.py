@@ -139,7 +139,7 @@ class RigQuery:
         if len(matches) > MAX_RANSAC_MATCHES:
             chosen = np.random.default_rng(seed).permutation(len(matches))
             kept = np.zeros(len(matches), bool)
-            kept[chosen[: MAX_RANSAC_MATCHES]] = True
+            kept[chosen[:MAX_RANSAC_MATCHES]] = True
             least_inliers = least_inliers * MAX_RANSAC_MATCHES // len(matches)
             matches = matches[kept]
         least_share = np.clip(least_inliers / len(matches), 1e-3, 0.99)

@@ -116,13 +116,10 @@ class Architecture:
         return layout
 
     def load(self, checkpoint: Path, dtype: "torch.dtype") -> Any:
-        """Return the network, on the CPU.
+        """Return the network, on the CPU; raise WeightsError if the file does not belong to it.
 
         It has `encode(images)` and is called as `network(images, heads, tokens)`, which returns the outputs of its
         heads.
-
-        Raises:
-            WeightsError: the file does not belong to this network.
         """
         network = getattr(self._imported, self.network).from_checkpoint(checkpoint, heads=HEADS, compute_dtype=dtype)
         if self.channels not in (None, network.channels):
@@ -133,12 +130,10 @@ class Architecture:
         return network
 
     def read(self, image: Path | NDArray[np.uint8], layout: "Layout") -> "tuple[Tensor, Size]":
-        """Return the network image (3, H, W) of an image, and the (width, height) of the image.
+        """Return the network image (3, H, W) of an image, and the (width, height) of the image; raise ImageError as
+        `read_image`.
 
         An image smaller than the images of its group gets a white border; a larger one is cropped to its middle.
-
-        Raises:
-            ImageError: the file is missing or cannot be decoded.
         """
         from toolkit.models.multiview import centered
 

@@ -90,14 +90,8 @@ class FeedForwardLocalizer(Localizer):
         turns: Turns | None = None,
         length: float = 1.0,
     ):
-        """
-        Args:
-            local_map: the triangulated map.
-            session: session with the map images and their depth maps.
-            predictor: predicts the cameras.
-            settings: default if None.
-            turns: turns that make images upright for the predictor; None shows them as stored.
-            length: depths of the depth maps are divided by it, see `Survey.length`.
+        """Depths of the depth maps of the map's session are divided by `length`, see `Survey.length`; `turns` make
+        images upright for the predictor.
         """
         self.map = local_map
         self.predictor = predictor
@@ -136,11 +130,8 @@ class FeedForwardLocalizer(Localizer):
         """Return the predictions for each query, made in one call of the predictor; see `Localizer`.
 
         `localize` aligns them to the map, in other threads while the network continues. An error in one query is not
-        raised and does not affect the other queries.
-
-        Raises:
-            Exception: a problem of all queries: the device does not exist, the weights are of another network, or the
-                memory is too small; see `errors.reason_of`.
+        raised and does not affect the others; one of all queries is, such as of the device, weights or memory, see
+        `errors.reason_of`.
         """
         expected, expected_groups = self._next
         same = [id(query.views) for query, _ in queries] == [id(query.views) for query, _ in expected]
@@ -257,9 +248,8 @@ class FeedForwardLocalizer(Localizer):
 
 
 def depth_of_images(session: Session, names: Sequence[str], length: float = 1.0) -> Callable[[int], SeenDepth]:
-    """Return a function that returns the depth of a map image, by its index in `names`, from the session's depth maps.
-
-    Depth is divided by `length`, see `Survey.length`.
+    """Return a function that returns the depth of a map image, by its index in `names`, from the session's depth maps,
+    divided by `length`, see `Survey.length`.
     """
     depths = DepthMaps(session)
 

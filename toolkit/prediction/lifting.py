@@ -69,11 +69,8 @@ class DepthLifter:
     """Lifts features of map images, of the first kind that `pnp` has, and localizes with them. Thread-safe."""
 
     def __init__(self, pnp: PnpLocalizer, seen_depth: Callable[[int], SeenDepth], most: int = MAX_MAP_FEATURES) -> None:
-        """
-        Args:
-            pnp: localizes with the triangulated points.
-            seen_depth: returns the depth of a map image from the capture's depth maps, see `depth_of_images`.
-            most: see `MappedFeatures`.
+        """`pnp` localizes with the triangulated points; `seen_depth` is as of `depth_of_images`; for `most` see
+        `MappedFeatures`.
         """
         self._first, self._pnp, self._seen_depth, self._most = pnp.matcher.mapped[0], pnp, seen_depth, most
         self._warned = False
@@ -87,10 +84,7 @@ class DepthLifter:
 
         The pose is `ok` by the rules of `PnpLocalizer`. Its covariance includes the unknown depth scale of each image.
         A pose from predicted depth of unmeasured scale is only `ok` if the predicted camera of the query agrees.
-
-        Args:
-            query, references, priors: as for `PnpLocalizer.localize`.
-            answer: result of `FeedForwardLocalizer.answer` for the query; None: only depth maps give depth.
+        Without the `answer` of `FeedForwardLocalizer`, only depth maps give depth.
         """
         count = len(self._first.map.image_names)  # larger indices are images of other kinds of features
         references = [retrieved.take(retrieved.images < count) for retrieved in references]

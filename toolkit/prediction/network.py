@@ -44,9 +44,7 @@ _LEAST_VIEWS = 2  # the query and one reference
 def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) -> Predictor:
     """Return the predictor of the settings. Warn about the simulated one, which uses the ground truth.
 
-    Raises:
-        ManifestError: the device or the precision does not exist.
-        WeightsError: the weights are missing; the message says how to get them.
+    Raise ManifestError if the device or the precision does not exist; WeightsError if the weights are missing.
     """
     predictor = settings.predictor
     if predictor.name != "simulated":
@@ -106,14 +104,13 @@ class NetworkPredictor:
         architecture: Architecture = ARCHITECTURES["vggt"],
         compile: bool = False,  # noqa: A002
     ) -> None:
-        """
+        """Find the weights: the file `checkpoint`, else the hub's, which is downloaded if need be.
+
         Args:
-            checkpoint: file with the weights; None takes the hub's cache, else downloads them.
             compute_device, dtype_compute: see `models.compute`. float16 is refused, as activations of the trunk may
                 overflow it; `auto` takes float32 where it would choose float16. The heads always run in float32.
             batch_size: largest number of groups per batch; None takes a default for the device.
             cache_bytes: memory of the CPU for encodings of map images.
-            architecture: the network.
             compile: see `PredictorSettings`.
 
         Raises:
@@ -360,10 +357,8 @@ def _load_network(
     device: "torch.device",
     compiled: bool,
 ) -> Any:
-    """Return a network, ready to run.
-
-    The last network stays loaded: a notebook that inspects a query after a run creates a new predictor, and loading
-    gigabytes of weights again would be slow.
+    """Return a network, ready to run. The last one stays loaded: a notebook that inspects a query after a run creates a
+    new predictor, and loading gigabytes of weights again would be slow.
     """
     key = (checkpoint.resolve(), files_fingerprint([checkpoint]), architecture.name, dtype, device, compiled)
     if key not in _loaded:

@@ -58,16 +58,9 @@ class SimulatedPredictor:
         wrong_references: float = 0.0,
         seed: int = 0,
     ) -> None:
-        """
-        Args:
-            sessions: sessions of the views, with ground truth.
-            map_dir: folder of triangulated maps. Without it, or without a map of a session, there is no depth.
-            features: kind of local features that the maps are triangulated from.
-            rotation_noise_deg: standard deviation of the rotation of a camera, as an angle.
-            position_noise_m: standard deviation of the position of a camera, as a length.
-            depth_noise: relative standard deviation of the depth of each pixel.
-            wrong_references: share of map images that get a random position and orientation.
-            seed: seed of all random numbers.
+        """Take the sessions of the views, with ground truth. Without `map_dir`, or without a map of a session, from
+        features of this kind, there is no depth. Noise is a standard deviation, of the depth a relative one;
+        `wrong_references` is the share of map images that get a random position and orientation.
         """
         self._sessions = {session.id: session for session in sessions}
         self._map_dir = None if map_dir is None else Path(map_dir)
@@ -97,11 +90,7 @@ class SimulatedPredictor:
         }
 
     def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
-        """Return a prediction for each group of views.
-
-        Raises:
-            CaptureError: the true pose of a view is unknown.
-        """
+        """Return a prediction for each group of views; raise CaptureError if the true pose of a view is unknown."""
         return [self._predict(list(group)) for group in groups]
 
     def _random(self, *key: Any) -> np.random.Generator:

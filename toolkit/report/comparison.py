@@ -179,11 +179,8 @@ def bootstrap(
 ) -> tuple[Floats, Floats]:
     """Return intervals of each run's recall and of its difference to the first run; each (2, R, T), 0 to 1.
 
-    Args:
-        hits: (Q, R, T), whether each query is within each threshold in each run.
-        unit: (Q,) numbers from 0; queries of the same number are drawn together.
-        seed: seed of the resamples.
-        resamples: number of resamples.
+    `hits` (Q, R, T) tells whether each query is within each threshold in each run; queries with the same number `unit`
+    (Q,) are drawn together.
     """
     count = np.bincount(unit)
     sums = np.zeros((len(count), *hits.shape[1:]))
@@ -386,10 +383,7 @@ def draw_changes(comparison: Comparison, most: int) -> "Iterator[tuple[str, list
     """Draw a regular sample of the queries won and lost; yield a title, and the titles and figures of both runs.
 
     Without figures, the title says why that query cannot be drawn: the capture has moved, or a run has not kept the
-    correspondences.
-
-    Args:
-        most: number of queries of each run; half of them lost and half won, if there are enough of both.
+    correspondences. Of each run, there are at most `most`, half of them lost and half won, if there are enough of both.
     """
     table, first = comparison.changes, comparison.names[0]
     for run in comparison.names[1:]:

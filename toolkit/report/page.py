@@ -140,11 +140,7 @@ def write_report(run_dir: str | Path) -> Path:
 
 
 def read_run(path: Path) -> dict[str, Any]:
-    """Return the content of a `run.json`, with empty values for missing keys.
-
-    Raises:
-        ArtifactError: the file is missing, torn, or not a record of a run.
-    """
+    """Return the content of a `run.json`, with empty values for missing keys; raise ArtifactError if it is none."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -375,10 +371,7 @@ def _escalation(queries: pd.DataFrame) -> list[str]:
 def _table(frame: pd.DataFrame, caption: str, formats: Mapping[str, Write] = {}, bars: Sequence[str] = ()) -> Markup:
     """Return a table as HTML, in a region that scrolls; empty if it has no rows.
 
-    Args:
-        formats: functions that write the numbers of columns. Without one, a number has no decimals. Recall and
-            `percent` are shaded.
-        bars: columns with bars behind their numbers.
+    Without one of the `formats`, a number has no decimals; recall and `percent` are shaded. Columns `bars` have bars.
     """
     from pandas.io.formats.style import Styler
 

@@ -84,12 +84,8 @@ def readable(table: pd.DataFrame, thresholds: Sequence[str]) -> pd.DataFrame:
 
 
 def write_tables(stem: Path, table: pd.DataFrame, shown: pd.DataFrame, caption: str) -> list[Path]:
-    """Write the main table as `<stem>.csv`, in numbers, and as `<stem>.tex`, which is no wider than the page.
-
-    Args:
-        table: the main table, see `main_table`.
-        shown: the same as texts.
-        caption: of the LaTeX table.
+    """Write the main table, and `shown`, the same as texts, as `<stem>.csv` and as `<stem>.tex`, no wider than the
+    page.
     """
     paths = [stem.with_name(f"{stem.name}{ending}") for ending in (".csv", ".tex")]
     if table.empty:
@@ -145,10 +141,8 @@ def _rows(path: Path) -> int:
 
 
 def method(files: SceneFiles, reranked: bool) -> str:
-    """Return how queries were localized, in sentences that can be quoted, from the settings beside the results.
-
-    Args:
-        reranked: whether the references are the reranked ones.
+    """Return how queries were localized, from references or `reranked` ones, in sentences that can be quoted, from the
+    settings beside the results.
     """
     said = list[str]()
     embed, retrieve = _settings(files.embeddings, EmbedSettings), _settings(files.retrieval_dir, RetrieveSettings)

@@ -173,11 +173,7 @@ class LocalizedPair:
     def open(
         cls, capture: Capture, map_device: str, query_device: str, poses_dir: str | Path, map_dir: str | Path | None
     ) -> "LocalizedPair":
-        """Open the stored results of the localize stage for a pair.
-
-        Raises:
-            ArtifactError: the poses, their table or their correspondences are missing or torn.
-        """
+        """Open the stored results of the localize stage for a pair; raise ArtifactError if they are missing or torn."""
         session = capture[f"{query_device}_query"]
         results = PairResults.of(poses_dir, capture.name, map_device, query_device)
         rows = session.rows_of_keyframes(results.table)
@@ -237,12 +233,8 @@ def query_details(
     map_session: Session,
     world_from_rig_true: Floats | None = None,
 ) -> QueryDetails:
-    """Return images, correspondences and references of a query.
-
-    Args:
-        result: how it was localized.
-        views, rig_from_cams: its images and their poses (C, 4, 4).
-        world_from_rig_true: its true pose (4, 4), if known.
+    """Return images, at their poses rig_from_cam (C, 4, 4), correspondences and references of a query, given its
+    result.
     """
     unknown = np.full((4, 4), np.nan)
     pose = unknown if result.world_from_rig is None else result.world_from_rig

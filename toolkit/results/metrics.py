@@ -36,10 +36,8 @@ UNKNOWN_UNIT = "L"
 
 
 def length_unit(record: Mapping[str, Any]) -> tuple[str, float]:
-    """Return the unit that lengths in a map are shown in, and its length in the unit of the poses.
-
-    Args:
-        record: the localize stage's record of the map, see `files.read_map_record`.
+    """Return the unit that lengths in a map are shown in, and its length in the unit of the poses, from the localize
+    stage's record of the map.
     """
     return ("m", 1.0) if record["unit"] or not record["depth"] else (UNKNOWN_UNIT, record["depth"] / 10)
 
@@ -256,13 +254,8 @@ def overlap_of(
     world_from_cam: Floats,
     camera: "pycolmap.Camera",
 ) -> float:
-    """Return `overlap_in_view` for the points that a reference sees; without a map, for a grid of points in its view.
-
-    Args:
-        reference: `path`, `sensor_id` and `Tws`, as in a file of references.
-        session: its session.
-        local_map: the triangulated map of the session.
-        world_from_cam, camera: pose (4, 4) and intrinsics of the other image.
+    """Return `overlap_in_view`, in the view of another image, for the points that a reference, as in a file of
+    references, sees in the triangulated map of its session; without a map, for a grid of points in its view.
     """
     pose = np.array(reference["Tws"], float)
     if local_map is not None:

@@ -33,11 +33,7 @@ def no_such_run(run: Path) -> ArtifactError:
 
 
 def localized_scenes(run: Path) -> list[str]:
-    """Return the names of the captures that a run has localized, in order.
-
-    Raises:
-        ArtifactError: there is no such run.
-    """
+    """Return the names of the captures that a run has localized, in order, or raise ArtifactError if it is none."""
     if not run.is_dir():
         raise no_such_run(run)
     return sorted(path.parent.name for path in run.glob("*/poses"))
@@ -46,8 +42,7 @@ def localized_scenes(run: Path) -> list[str]:
 def pairs_in_map(files: SceneFiles, device: str) -> list[Path]:
     """Return `poses/<pair>.h5` of all pairs with a map device; of a map without queries, its own file.
 
-    Raises:
-        ArtifactError: unknown run, scene or device; the message lists the known ones.
+    Raise ArtifactError for an unknown run, scene or device; the message lists the known ones.
     """
     if files.scene not in (scenes := localized_scenes(files.run)):
         known = nearest(files.scene, scenes)
@@ -84,13 +79,8 @@ def _unreadable(path: Path, error: Exception) -> ArtifactError:
 
 
 def how_localized(pair: Path) -> Localized:
-    """Return how the queries of a pair were localized.
-
-    Args:
-        pair: `poses/<pair>.h5`.
-
-    Raises:
-        ArtifactError: the file is missing, damaged, or lacks the attributes.
+    """Return how the queries of a pair, `poses/<pair>.h5`, were localized; raise ArtifactError if the file does not say
+    it.
     """
     try:
         with h5py.File(pair, "r") as file:
@@ -122,10 +112,8 @@ AnySettings = TypeVar("AnySettings", bound=Settings)
 
 
 def read_settings(path: Path, model: type[AnySettings]) -> AnySettings:
-    """Return the settings that a stage wrote beside its results.
-
-    Raises:
-        ArtifactError: the file is missing, damaged, or of another version.
+    """Return the settings that a stage wrote beside its results; raise ArtifactError if it did not, or in another
+    version.
     """
     try:
         return model.of(json.loads(path.read_text(encoding="utf-8")))
@@ -140,10 +128,8 @@ def session_fingerprint(session: Session) -> str:
 
 
 def map_inputs(session: Session, features: FeatureStore) -> str:
-    """Return 16 hex digits that identify what a map is made of, `inputs` of its record: its session and features.
-
-    Args:
-        features: features of images of other sessions are ignored.
+    """Return 16 hex digits that identify what a map is made of, `inputs` of its record: its session and the features of
+    its images.
     """
     return fingerprint([session_fingerprint(session), features.only(session.image_names).fingerprint])
 
@@ -151,13 +137,8 @@ def map_inputs(session: Session, features: FeatureStore) -> str:
 def attributes(
     settings: LocalizeSettings, kinds: Sequence[LocalMethod], capture: Capture, device: str, retrieval_dir: Path
 ) -> dict[str, str]:
-    """Return the attributes of a pair's `.h5` file from which `Map.open` opens the map.
-
-    Args:
-        settings, kinds: those that the queries were localized with.
-        capture: the capture.
-        device: the map device.
-        retrieval_dir: folder of the references.
+    """Return the attributes of a pair's `.h5` file from which `Map.open` opens the map: with what its queries were
+    localized, and where the capture and the references are.
     """
     return {
         MAPS: json.dumps([map_path("", f"{device}_map", kind.name).name for kind in kinds if settings.map is not None]),

@@ -65,13 +65,9 @@ class Cluster:
 
     def run(self, function: Callable[..., None], shares: Sequence[tuple[Any, ...]], sizes: Sequence[int], label: str,
             unit: str) -> None:  # fmt: skip
-        """Call a function once per share on the workers, and return when all shares are done.
+        """Call a function once per share on the workers, and return when all shares, each of `sizes` units, are done.
 
-        Args:
-            function: a function of the toolkit that does one share. If a worker dies, it is called again for its share.
-            shares: arguments of each call.
-            sizes: number of units in each share, for the progress bar.
-            label, unit: of the progress bar.
+        If a worker dies, the function is called again for its share.
 
         Raises:
             ToolkitError: a share killed several workers, or no worker is left. Errors of the function are raised too.
@@ -131,8 +127,7 @@ def _run_share(here: str, environment: Mapping[str, str], pickled: bytes) -> Non
 def current_cluster() -> Cluster | None:
     """Return the cluster that `TOOLKIT_CLUSTER` names; None without one: this process does all work itself.
 
-    Raises:
-        ToolkitError: the cluster does not answer.
+    Raise ToolkitError if it does not answer.
     """
     address = os.environ.get(ADDRESS)
     return None if address is None else Cluster(_client(address))

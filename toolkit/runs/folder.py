@@ -41,10 +41,8 @@ _VERSIONS = ("numpy", "pycolmap", "faiss-cpu", "opencv-python-headless", "pandas
 def held(run_dir: Path) -> Iterator[None]:
     """Lock a run folder, log to its `run.log`, and remove the leftovers of a killed run.
 
-    The operating system releases the lock when the process ends, however it ends.
-
-    Raises:
-        ToolkitError: another run holds the lock; the message names its process, host and start.
+    The operating system releases the lock when the process ends, however it ends. Raise ToolkitError if another run
+    holds it; the message names its process, host and start.
     """
     run_dir.mkdir(parents=True, exist_ok=True)
     holder = run_dir / ".run.lock.json"
@@ -94,12 +92,8 @@ def _sweep(run_dir: Path) -> None:
 
 
 def log_to(path: Path) -> ExitStack:
-    """Log to a file, with times: all messages of the toolkit, debug included, and warnings of other libraries.
-
-    Warnings still appear on the terminal.
-
-    Returns:
-        Context that ends the logging when it closes.
+    """Log to a file, with times, until the returned context closes: all messages of the toolkit, debug included, and
+    warnings of other libraries, which still appear on the terminal.
     """
     root, own, ending = logging.getLogger(), logging.getLogger("toolkit"), ExitStack()
     file = logging.FileHandler(path, encoding="utf-8")
@@ -165,11 +159,10 @@ class RunLog:
         self.write()
 
     def end(self, error: BaseException | None = None, incomplete: str | None = None) -> None:
-        """Write how the run ended. If the disk is too full for that, remove the record rather than leave a wrong one.
+        """Write how the run ended: stopped by an error, or at its end, perhaps `incomplete`, with a description of the
+        failures.
 
-        Args:
-            error: the error that stopped the run.
-            incomplete: description of the failures, for a run that reached its end.
+        If the disk is too full for that, remove the record rather than leave a wrong one.
         """
         self.status, self.error, self.exit_code = ("incomplete", incomplete, 2) if incomplete else ("done", None, 0)
         if error is not None:

@@ -73,12 +73,8 @@ class PairRows:
             raise ArtifactError(reason)
 
     def frame(self, settings: Settings | None = None) -> pd.DataFrame:
-        """Return the table, and write the settings, if given, beside the stage's results.
-
-        `reason` is empty for finished pairs; the other columns of a left-out pair are zero.
-
-        Raises:
-            ToolkitError: no pair could be done; the error of the first one.
+        """Return the table, and write the settings, if given, beside the stage's results; raise the first pair's error
+        if no pair could be done. `reason` is empty for finished pairs; the other columns of a left-out pair are zero.
         """
         done = next((row for row in self.rows if not row["reason"]), None)
         if done is None and self.errors:

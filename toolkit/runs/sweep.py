@@ -24,12 +24,7 @@ TAKEN = ("embed", "retrieve", "rerank", "localize", "sequence")
 
 
 def changed_keys(plain: Manifest, changed: Manifest, overrides: Iterable[str]) -> dict[str, str]:
-    """Return, by key, the values of overrides that change a result.
-
-    Args:
-        plain, changed: the manifest without and with all overrides.
-        overrides: `key=value` each.
-    """
+    """Return, by key, the values of the overrides, `key=value` each, that make a difference between two manifests."""
     before, after = (manifest.model_dump(mode="json") for manifest in (plain, changed))
     keys = {}
     for override in overrides:
@@ -64,9 +59,6 @@ def swept_runs(name: str, sweeps: Sequence[str]) -> dict[str, list[str]]:
 
     Returns:
         The overrides of each run, `key=value` each as for `--set`, by its name, `<manifest>-<key>-<value>`.
-
-    Raises:
-        ManifestError: a sweep has another form, repeats a key, changes the captures, or has too many runs.
     """
     values: dict[str, list[str]] = {}
     for sweep in sweeps:
@@ -97,15 +89,11 @@ def swept_runs(name: str, sweeps: Sequence[str]) -> dict[str, list[str]]:
 
 
 def take_over(donors: Sequence[Path], own: Manifest) -> None:
-    """Fill a new run folder with the results of another run that do not depend on the settings that differ.
+    """Fill a new run folder with the results of the donor, a run folder, that shares most with it.
 
     These are features, maps, and the results of all stages before the first stage with other settings. Too much does no
     harm: each stage reuses only what fits its settings. Files become hard links, since the toolkit never changes a file
-    but replaces it as a whole; or copies, if the disk does not support links.
-
-    Args:
-        donors: run folders; the one that shares most results is taken.
-        own: manifest of the run. Scenes that already have a folder are skipped.
+    but replaces it as a whole; or copies, if the disk does not support links. Scenes that have a folder are skipped.
     """
     shared = {donor: _shared_stages(donor, own) for donor in donors if donor.is_dir()}
     donor = max(shared, key=lambda donor: shared[donor], default=None)

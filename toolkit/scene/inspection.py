@@ -47,15 +47,8 @@ class InspectedPair:
         map_dir: str | Path | None = None,
         sessions_root: str | Path | None = None,
     ) -> None:
-        """
-        Args:
-            map_device, query_device: the pair.
-            poses_dir, features_dir, map_dir: folders of the localize stage; None: the folders of the run that
-                `poses_dir` belongs to.
-            sessions_root: `<capture>/sessions`; None: its path when the pair was localized.
-
-        Raises:
-            ArtifactError: the pair does not exist, or its files are missing or torn.
+        """Open a pair; folders are those of the run of `poses_dir`, and the capture's is as when the pair was
+        localized, unless given. Raise ArtifactError if the pair does not exist, or its files are missing or torn.
         """
         pairs = {pair_devices(path.stem): path for path in sorted(Path(poses_dir).glob("*_map_*_query_*.h5"))}
         if (map_device, query_device) not in pairs:
@@ -80,10 +73,8 @@ class InspectedPair:
         return len(self.names)
 
     def look(self, query: int | str = 0) -> Answer:
-        """Return a query with the stored results of the localize stage.
-
-        Args:
-            query: its number, the name of one of its images (or a unique end of the name), or `worst`.
+        """Return a query with the stored results of the localize stage, by its number, the name of one of its images
+        (or a unique end of the name), or `worst`.
 
         Raises:
             ArtifactError: no query matches, or several do (the nearest is named), or its stored results are damaged.
@@ -155,11 +146,8 @@ class WorstQueries:
         map_device: str = "all",
         query_device: str = "all",
     ) -> None:
-        """Take the queries of all pairs in a folder of poses that have stored correspondences and can be read.
-
-        Args:
-            poses_dir, map_dir, sessions_root: as for `InspectedPair`.
-            map_device, query_device: devices of the pairs, or `all`.
+        """Take the queries of all pairs, or those of a device, in a folder of poses that have stored correspondences
+        and can be read. The folders are as for `InspectedPair`.
         """
         pairs: list[InspectedPair] = []
         for path in sorted(Path(poses_dir).glob("*_map_*_query_*.h5")):
@@ -186,12 +174,8 @@ class WorstQueries:
     def look(self, rank: int | str = 0) -> Answer:
         """Return a query by its rank, 0 for the worst of all, or by the name of one of its images.
 
-        `worst` is the worst one with matches, as those without, such as a torn file, have little to show.
-
-        A query that was localized in several maps is returned where it is worst.
-
-        Raises:
-            ArtifactError: the rank is out of range; or no query has the name, or several do.
+        `worst` is the worst one with matches, as those without, such as a torn file, have little to show. A query that
+        was localized in several maps is returned where it is worst. Raise ArtifactError if there is none.
         """
         if rank == WORST:
             tables = (pair.localized.results.table for pair, _ in self._queries)
@@ -233,16 +217,10 @@ class Choice:
 
 
 def choose(queries: Any, chosen: int | str = 0) -> Choice:
-    """Show a query, and a list to choose another in its place; return the choice.
+    """Show a query of `RetrievedPair`, `InspectedPair` or `WorstQueries`, and a list to choose another in its place.
 
     The figure is ordinary output, which a saved notebook keeps. There is no list when the pipeline runs the notebook.
-
-    Args:
-        queries: `RetrievedPair`, `InspectedPair` or `WorstQueries`: has `names`, and `look`, which takes a number.
-        chosen: number or name of the first query, `inspect` in notebooks; ignored if it is a number without queries.
-
-    Raises:
-        ArtifactError: the query does not exist.
+    `chosen` is the number or name of the first query, which must exist, unless it is a number and there are no queries.
     """
     from IPython.display import display
 

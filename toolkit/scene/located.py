@@ -62,10 +62,8 @@ class Located:
         answer: Callable[[QueryResult], "Answer"],
         open_query: Callable[[], tuple[Map, Query, Sequence[References]]],
     ) -> None:
-        """
-        Args:
-            answer: returns how the query was localized, given one of its results.
-            open_query: returns map, query and references, to localize again.
+        """`answer` returns how the query was localized, given one of its results; `open_query` what is needed to do it
+        again.
         """
         self.answer, self.open = answer, open_query
 
@@ -170,10 +168,8 @@ def ranks(scene_map: Map, references: Sequence[References]) -> dict[str, tuple[i
 
 
 def best_ranks(references: Iterable[Iterable[tuple[str, float]]]) -> dict[str, tuple[int, float]]:
-    """Return the best rank, from 1, and the score of each reference by its name, best first.
-
-    Args:
-        references: names and scores of the references of each image of a query, best first.
+    """Return the best rank, from 1, and the score of each reference by its name, best first, of the names and scores of
+    the references of each image of a query, best first.
     """
     best: dict[str, tuple[int, float]] = {}
     for of_image in references:

@@ -266,9 +266,7 @@ class Map:
             references.append(References(indices[indices >= 0], scores[indices >= 0]))
         return references
 
-    def match(
-        self, query: Query, references: Sequence[References], localizer: Localizer | None = None
-    ) -> QueryMatches:
+    def match(self, query: Query, references: Sequence[References], localizer: Localizer | None = None) -> QueryMatches:
         """Return the matches of a query with its references; they are computed when they are needed.
 
         Localizers assume map lengths, and so do the matches. `localizer` is that of the map or, with the fallback
@@ -419,9 +417,7 @@ class Map:
         remark = "; ".join(filter(None, ["" if result.misfit else result.remark, self.consistency.text]))
         what = "poses" if self.consistency.verdict == "inconsistent" else "intrinsics"
         reason = f"the {what} of the map contradict its images"
-        return replace(
-            result, status=Status.LOW_CONFIDENCE, reason=reason, remark=remark, focals_px=(), centers_px=()
-        )
+        return replace(result, status=Status.LOW_CONFIDENCE, reason=reason, remark=remark, focals_px=(), centers_px=())
 
     def _prior(self, near: RoughPose, references: Sequence[References]) -> Prior:
         images = np.unique(np.concatenate([retrieved.images for retrieved in references]))

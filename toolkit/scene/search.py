@@ -71,12 +71,10 @@ class ReferenceSearch:
     def find(
         self, query: Query, k: int | None = None, allowed: Sequence[NDArray[np.bool_] | None] = ()
     ) -> list[Ranked]:
-        """Return the references of each image of a query, as the run would find them.
+        """Return the references of each image of a query with the descriptors of `describe`, as the run would find
+        them.
 
-        Args:
-            query: with the descriptors of `describe`.
-            k: number of references; None: as many as in the run.
-            allowed: for each image a mask over the rows `rows`, or None; empty: all map images.
+        By default, there are `k` as in the run; `allowed` has, for each image, a mask over the rows `rows`, or None.
 
         Raises:
             ArtifactError: the map was embedded by another embedder.
@@ -136,11 +134,7 @@ class ReferenceSearch:
 
     @cached_property
     def embedders(self) -> list[Embedder]:
-        """The embedders that the run used.
-
-        Raises:
-            ArtifactError: the map's vectors are from another one.
-        """
+        """The embedders that the run used; ArtifactError is raised if the map's vectors are from another one."""
         settings = self.embed_settings
         folders = embedding_folders(self.files.embeddings).values()
         learned = {

@@ -18,11 +18,7 @@ class StoredQueries:
     """The queries of a session with what a run stored of them."""
 
     def __init__(self, session: Session, retrieval: str | Path) -> None:
-        """Take the query session, and read the references of its images from `retrieval/<pair>.jsonl`.
-
-        Raises:
-            ArtifactError: see `files.read_references`.
-        """
+        """Take the query session, and read the references of its images from `retrieval/<pair>.jsonl`."""
         self.session = session
         self.references = {
             (int(row["timestamp"]), str(row["sensor_id"])): [
@@ -37,11 +33,7 @@ class StoredQueries:
         """Per kind, the stored network matches, or None."""
 
     def open_features(self, scene_map: Map) -> None:
-        """Open the features of the queries that a map's run has stored.
-
-        Raises:
-            ArtifactError: they are missing.
-        """
+        """Open the features of the queries that a map's run has stored; raise ArtifactError if they are missing."""
         if scene_map.features_dir is None:
             return
         folder, session = scene_map.features_dir, self.session.id
@@ -54,11 +46,8 @@ class StoredQueries:
         self.stores = [FeatureStore.open(path) for path in paths]
 
     def query(self, scene_map: Map, rows: Ints) -> QueryInput:
-        """Return a query and the references of each of its images; an image without an entry has none.
-
-        Args:
-            scene_map: the map in which it is localized.
-            rows: rows of `session.images` that one device took at one instant.
+        """Return the query in rows of `session.images`, which one device took at one instant, and the references of
+        each of its images in the map; an image without an entry has none.
         """
         query, images = scene_map.query_of_session(self.session, rows), self.session.images.iloc[rows]
         names, index_of = [view.name for view in query.views], scene_map.index_of

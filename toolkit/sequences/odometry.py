@@ -378,9 +378,7 @@ def fitted_scale(odometry: Odometry, queries: PosedQueries, settings: SequenceSe
     lag = 1
     while lag < len(queries):
         first, second = np.arange(len(queries) - lag), np.arange(lag, len(queries))
-        by_odometry, by_poses = (
-            (geometry.invert(poses[first]) @ poses[second])[:, :3, 3] for poses in (moved, placed)
-        )
+        by_odometry, by_poses = ((geometry.invert(poses[first]) @ poses[second])[:, :3, 3] for poses in (moved, placed))
         turn, shift = odometry.drift(settings, queries.frames[first], queries.frames[second])
         length2 = (by_odometry**2).sum(axis=1)
         variance = shift**2 + position[first] + position[second] + length2 * (turn**2 + rotation[first])
@@ -400,4 +398,3 @@ def first_guess(odometry: Odometry, queries: PosedQueries) -> Floats:
     nearest = np.searchsorted(between, traveled)
     moved = odometry.odom_from_rig
     return queries.world_from_rig[nearest] @ geometry.invert(moved[queries.frames[nearest]]) @ moved
-

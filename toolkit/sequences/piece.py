@@ -50,13 +50,8 @@ def localize_piece(
 ) -> LocalizedPiece:
     """Return the poses of a piece of odometry: of all frames, or only of the queries if `settings.online`.
 
-    Args:
-        queries: the queries that have a pose.
-        query_frames: (A,) frames of all queries, ascending.
-        again: localizes queries again that are not `ok` or do not fit the graph; None: keep their poses.
-
-    Raises:
-        ManifestError: GTSAM is not installed.
+    Of all `query_frames` (A,), ascending, those in `queries` have a pose. Those that are not `ok` or do not fit the
+    graph are localized `again`; None: they keep their poses. Raise ManifestError if GTSAM is not installed.
     """
     first = _placed(odometry, queries, query_frames, settings)
     sure = queries.frames[first.used & queries.trusted]

@@ -52,11 +52,7 @@ class PlacedPiece:
 
 
 def place_online(odometry: Odometry, queries: PosedQueries, frames: Ints, settings: SequenceSettings) -> PlacedPiece:
-    """Return the poses of some frames of a piece, each only from the last `settings.length_s` seconds before it.
-
-    Raises:
-        ManifestError: GTSAM is not installed.
-    """
+    """Return the poses of some frames of a piece, each only from the last `settings.length_s` seconds before it."""
     length_us = np.inf if settings.length_s is None else settings.length_s * 1e6
     count = len(odometry)
     piece = PlacedPiece(
@@ -79,11 +75,7 @@ def place_online(odometry: Odometry, queries: PosedQueries, frames: Ints, settin
 
 
 def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> PlacedPiece:
-    """Return the poses of a piece of odometry, from the poses of single queries in it.
-
-    Raises:
-        ManifestError: GTSAM is not installed.
-    """
+    """Return the poses of a piece of odometry, from the poses of single queries in it."""
     count = len(odometry)
     if not len(queries):
         nothing = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan), np.zeros(0, bool)
@@ -134,10 +126,9 @@ def _chi2(poses: Floats, covariances: Floats, queries: PosedQueries) -> Floats:
 
 
 def _optimized(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> tuple[Floats, Floats]:
-    """Solve the pose graph. Return world_from_rig (N, 4, 4) and covariances (N, 6, 6).
+    """Solve the pose graph; raise ArtifactError if its linear system is singular in float64.
 
-    Raises:
-        ArtifactError: the linear system is singular in float64.
+    Return world_from_rig (N, 4, 4) and covariances (N, 6, 6).
     """
     gtsam = optional("gtsam")
     graph, values = _motion_graph(odometry, queries, settings), gtsam.Values()

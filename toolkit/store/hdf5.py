@@ -31,10 +31,8 @@ MOST_TEXTS = 1 << 12
 def write_groups(
     path: Path, groups: Iterable[tuple[str, Mapping[str, NDArray[Any]]]], attributes: Mapping[str, Any]
 ) -> None:
-    """Write a file of groups, each given by its name and arrays of numbers or texts; it replaces an earlier file.
-
-    Args:
-        attributes: attributes of the file.
+    """Write a file of groups, each given by its name and arrays of numbers or texts, with `attributes`; it replaces
+    one.
     """
     text = h5py.string_dtype()
     with write_atomic(path) as temporary, h5py.File(temporary, "w", libver="latest") as file:
@@ -47,13 +45,11 @@ def write_groups(
 
 
 def read_group(file: h5py.File, name: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a group, from a file of this toolkit or of another tool.
+    """Return the arrays of a group, from a file of this toolkit or of another tool; raise DamagedError if they are not
+    whole.
 
     Reads only numbers and texts that the file itself contains, and not more than fit into it: a malicious file of a few
     bytes could declare huge arrays, or link to other files.
-
-    Raises:
-        DamagedError: the group is missing, or its content does not match its checksum.
     """
     try:
         group = _open_owned(file, name)

@@ -120,11 +120,8 @@ class Items(Mapping[str, dict[str, NDArray[Any]]]):
             return {}
 
     def __getitem__(self, name: str) -> dict[str, NDArray[Any]]:
-        """Return the arrays of an item.
-
-        Raises:
-            KeyError: there is no such item.
-            DamagedError: its content is not what was written.
+        """Return the arrays of an item; raise KeyError if there is none, DamagedError if its content is not what was
+        written.
         """
         entry = self._entries[name]
         if not entry.shard.exists():  # another process has put it into a later one
@@ -169,12 +166,8 @@ class Items(Mapping[str, dict[str, NDArray[Any]]]):
     ) -> list[Item]:  # fmt: skip
         """Let the workers of the cluster, if there is one, make items; return those that are left for this process.
 
-        Args:
-            function: makes items; called as `function(folder, items, *arguments)` with this folder, opened by the
-                worker, and the items of a share that are not there yet.
-            arguments: further arguments of `function`.
-            label, unit: of the progress bar.
-            multiple: shares have a multiple of this number of items.
+        `function(folder, items, *arguments)` makes the items of a share that are not there yet, in this folder, opened
+        by the worker. Shares have a multiple of `multiple` items; `label` and `unit` are of the progress bar.
         """
         cluster = current_cluster() if items else None
         if cluster is None:
@@ -187,12 +180,10 @@ class Items(Mapping[str, dict[str, NDArray[Any]]]):
         return self.left(items)
 
     def add(self, name: str, source: str = "", arrays: Arrays | None = None, note: Any = None) -> None:
-        """Add an item, which replaces one of the same name.
+        """Add an item, which replaces one of the same name: arrays of numbers, or of texts as objects.
 
-        Args:
-            source: fingerprint of what it was made from, besides the settings `made_by`.
-            arrays: arrays of numbers, or of texts as objects.
-            note: any JSON, which is in memory while the folder is open.
+        `source` is a fingerprint of what it was made from, besides the settings `made_by`; the note, any JSON, is in
+        memory while the folder is open.
         """
         data = _packed(arrays or {})
         self._added[name] = source, note, data

@@ -350,18 +350,15 @@ def render_capture(
 ) -> Path:
     """Render a capture of `rooms` rooms by a phone, a headset and a robot; return its folder.
 
-    Each device has a map and a query session of two subsessions; each subsession walks through all rooms. If the
-    folder contains this capture already, nothing is done. Time grows with rooms * frames, memory does not.
+    Each device has a map and a query session of two subsessions; each subsession walks through all rooms. If the folder
+    contains this capture already, nothing is done. Time grows with rooms * frames, memory does not.
 
-    Args:
-        out: the capture's folder; its name is the scene's name. `demo.json` in it records the settings.
-        rooms, frames, seed, options: the settings `DemoData` of a manifest. The same seed gives the same bytes. A
-            query recording of given length (`seconds`, at least 20 per room) has odometry at 5 Hz. Without, it has one
-            image per 1.4 s, and odometry at the images only.
+    The name of `out` is the scene's name; `demo.json` in it records the settings `DemoData` of a manifest. The same
+    seed gives the same bytes. A query recording of given length (`seconds`, at least 20 per room) has odometry at 5 Hz.
+    Without, it has one image per 1.4 s, and odometry at the images only.
 
-    Raises:
-        ManifestError: an unknown or invalid setting.
-        CaptureError: settings that exclude each other, or `out` contains something other than a rendered capture.
+    Raise ManifestError for an invalid setting; CaptureError for those that exclude each other, or if `out` contains
+    something other than a rendered capture.
     """
     world = World.of({"rooms": rooms, "frames": frames, "seed": seed, **options})
     seconds = world.seconds

@@ -20,17 +20,10 @@ GAP_S = 4.0  # length of a gap in odometry
 
 
 def every_frame(times: Ints, world_from_rig: Floats, start: int, seconds: float) -> tuple[Ints, Floats]:
-    """Interpolate the poses of a recording at `RATE_HZ`.
+    """Interpolate the poses of a recording of a length at `RATE_HZ`, from those of its images, (M >= 2,) and (M, 4, 4).
 
-    The path between two images is straight; before the first and after the last image the device stands still.
-
-    Args:
-        times, world_from_rig: the recording's images, (M >= 2,) microseconds and (M, 4, 4).
-        start: start of the recording, microseconds.
-        seconds: length of the recording.
-
-    Returns:
-        Times (N,), microseconds, and poses world_from_rig (N, 4, 4), including those of the images.
+    The path between two images is straight; before the first and after the last image the device stands still. Return
+    times (N,), microseconds, and poses world_from_rig (N, 4, 4), including those of the images.
     """
     period = round(1e6 / RATE_HZ)
     grid = np.arange(start, start + round(seconds * 1e6), period)
@@ -76,16 +69,10 @@ def odometry_of(rng: Rng, world_from_rig: Floats, drift: float, parts: float = 1
 def tracked(
     rng: Rng, times: Ints, world_from_rig: Floats, drift: float, parts: float, losses: int, gaps: int
 ) -> tuple[NDArray[np.bool_], Floats]:
-    """Simulate the odometry of a recording with interruptions.
+    """Simulate the odometry of a recording with interruptions, see `odometry_of`, at (N,) times and poses (N, 4, 4).
 
-    Args:
-        times, world_from_rig: all frames of the recording, (N,) microseconds and (N, 4, 4).
-        drift, parts: see `odometry_of`.
-        losses: number of tracking losses; after each, odometry continues in another frame and with another scale.
-        gaps: number of gaps of `GAP_S` without odometry; the frame stays the same.
-
-    Returns:
-        Which frames have odometry, (N,), and odom_from_rig (N, 4, 4).
+    After each loss of tracking, it continues in another frame and with another scale; a gap without odometry lasts
+    `GAP_S`. Return which frames have odometry, (N,), and odom_from_rig (N, 4, 4).
     """
     count = losses + gaps
     is_loss = rng.permutation(np.arange(count) < losses)

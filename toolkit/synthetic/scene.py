@@ -248,11 +248,8 @@ def _cells(height: float, width: float, colors: Any, stagger: str, **options: An
 
 
 def build_room(seed: int, index: int, look: int | None = None) -> Scene:
-    """Return the geometry and materials of a room; `render.paint` makes its textures.
-
-    Args:
-        index: number of the room, which determines its position.
-        look: number of the room whose appearance it has; None: its own.
+    """Return the geometry and materials of a room, at the position of its index, with its own look or that of another
+    index; `render.paint` makes its textures.
     """
     look = index if look is None else look
     rng = named_rng(seed, look, "room")

@@ -114,11 +114,7 @@ def world_axes(up: Floats) -> Any:
 
 
 def scene_view(poses: Floats, up: Floats, name: str) -> Any:
-    """Return the 3D view, seen from behind and above the place with the most cameras (N, 4, 4).
-
-    Args:
-        up: up direction (3,) of any length.
-    """
+    """Return the 3D view, from behind and above the place with the most cameras (N, 4, 4); up (3,) has any length."""
     controls = None
     if len(poses):
         eye = Eye.of(poses, up)

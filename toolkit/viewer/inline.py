@@ -21,11 +21,7 @@ MAX_INLINE_BYTES = 200_000_000
 
 
 def show_picture(path: str | Path) -> Any:
-    """Return a picture file for a notebook, which enlarges it on a click: as it is, or as a JPEG if that is smaller.
-
-    Raises:
-        ArtifactError: the picture is missing or cannot be read.
-    """
+    """Return a picture file for a notebook, which enlarges it on a click: as it is, or as a JPEG if that is smaller."""
     import PIL.Image
     from IPython.display import HTML
 
@@ -38,16 +34,9 @@ def show_picture(path: str | Path) -> Any:
 
 
 def show_recording(path: str | Path, height: int = 600) -> Any:
-    """Show a recording in a notebook: a link, the command that opens it, and the viewer itself.
+    """Show a recording in a notebook: a link, the command that opens it, and the viewer itself, `height` pixels high.
 
-    Args:
-        height: height of the viewer, pixels.
-
-    Returns:
-        The viewer's widget; None without a viewer.
-
-    Raises:
-        ArtifactError: the recording is missing.
+    Return the viewer's widget; None without a viewer. Raise ArtifactError if the recording is missing.
     """
     from IPython.display import HTML, display
 

@@ -100,9 +100,7 @@ def _layout(name: str, poses: Floats, up: Floats, has_queries: bool) -> Any:
     # Show marks only in the 2D views: on the image planes of the 3D scene they would hide it.
     scene.contents = ["+ $origin/**", *(f"- /{path}/marks/**" for path in (cameras | ranked).values())]
     query = rrb.Tabs(*(rrb.Spatial2DView(origin=path, name=name) for name, path in cameras.items()))
-    references = rrb.Grid(
-        *(rrb.Spatial2DView(origin=path, name=name) for name, path in ranked.items()), grid_columns=2
-    )
+    references = rrb.Grid(*(rrb.Spatial2DView(origin=path, name=name) for name, path in ranked.items()), grid_columns=2)
     about = rrb.Horizontal(
         rrb.TextDocumentView(origin="about", name="about the query"),
         rrb.Spatial2DView(origin="legend", name="colors"),
