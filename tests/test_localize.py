@@ -535,7 +535,7 @@ def test_a_network_is_asked_once_about_a_query_that_escalates(
     add_other_kind(monkeypatch)
     predictor, asked = ByContent(Capture.open(small_capture), run.maps), list[int]()
 
-    def predict(groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]]) -> list[Prediction]:
+    def predict(groups: Sequence[Sequence[View]]) -> list[Prediction]:
         asked.append(len(groups))
         return ByContent.predict(predictor, groups)
 
@@ -1052,7 +1052,7 @@ class ByContent:
             for row in session.camera_rows.tolist()
         }
 
-    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
         def named(view: View) -> View:
             pixels = read_image(view.image) if isinstance(view.image, Path) else view.image
             return replace(view, name=self.names[pixels.tobytes()])

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -488,11 +487,10 @@ class _Pair:
     def _predicted(self, numbers: Sequence[int]) -> Iterator[_Task]:
         """Yield queries with the predictions of a network, which runs on batches of queries."""
         size = self.map.localizer.batch_size
-        batches = [numbers[start : start + size] for start in range(0, len(numbers), size)]
-        loaded = ([self.query(number) for number in batch] for batch in [*batches, []])
-        for batch, (queries, following) in zip(batches, pairwise(loaded), strict=True):
-            started = time.perf_counter()
-            predictions = self.map.predict(queries, following)
+        for start in range(0, len(numbers), size):
+            batch = numbers[start : start + size]
+            queries, started = [self.query(number) for number in batch], time.perf_counter()
+            predictions = self.map.predict(queries)
             seconds = (time.perf_counter() - started) / len(batch)
             for number, query, prediction in zip(batch, queries, predictions, strict=True):
                 yield number, query, prediction, seconds

@@ -86,7 +86,7 @@ class Refocused(SimulatedPredictor):
     focal_factors = (1.0, 1.0)
     """Of the query's focal length, and of the references'."""
 
-    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
         found = []
         for group, prediction in zip(groups, super().predict(groups), strict=True):
             K = np.stack([view.camera.calibration_matrix() for view in group])
@@ -136,7 +136,7 @@ class Coincident:
         self.base = base
         self.settings: dict[str, object] = {}
 
-    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
         found = []
         for prediction in self.base.predict(groups):
             poses = prediction.model_from_cams.copy()
@@ -220,7 +220,7 @@ class Failing(SimulatedPredictor):
     bad = ""
     how = "raise"
 
-    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
         found = super().predict(groups)
         for index, group in enumerate(groups):
             if self.bad and self.bad in group[0].name:
@@ -289,7 +289,7 @@ def test_threads_that_localize_ask_the_network_one_after_the_other(world: World)
     together: list[int] = []
 
     class Slow(SimulatedPredictor):
-        def predict(self, groups: Sequence[Sequence[View]], following: object = ()) -> list[Prediction]:
+        def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
             running.append(1)
             time.sleep(0.02)
             together.append(len(running))
@@ -390,7 +390,7 @@ def test_rows_do_not_depend_on_batches_threads_or_being_killed(
     asked: list[int] = []
     predict = SimulatedPredictor.predict
 
-    def killed(self: SimulatedPredictor, groups: Sequence[Sequence[View]], following: object) -> list[Prediction]:
+    def killed(self: SimulatedPredictor, groups: Sequence[Sequence[View]]) -> list[Prediction]:
         asked.append(len(groups))
         if len(asked) == 2:
             raise KeyboardInterrupt
@@ -406,31 +406,6 @@ def test_rows_do_not_depend_on_batches_threads_or_being_killed(
     assert (table_of(run, "spot"), run.poses_txt("ios", "spot").read_bytes()) == expected
 
 
-def test_the_predictor_is_told_what_it_will_be_asked_next(
-    run: SceneFiles, small_capture: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """So that it can read the photographs of the next call during this one."""
-    calls: list[tuple[object, object]] = []
-    chosen: list[object] = []
-    predict, choose = SimulatedPredictor.predict, FeedForwardLocalizer._choose
-
-    def listens(self: SimulatedPredictor, groups: object, following: object) -> list[Prediction]:
-        calls.append((groups, following))
-        return predict(self, groups)  # type: ignore[arg-type]
-
-    def counts(self: FeedForwardLocalizer, references: References) -> object:
-        chosen.append(references)
-        return choose(self, references)
-
-    monkeypatch.setattr(SimulatedPredictor, "predict", listens)
-    monkeypatch.setattr(FeedForwardLocalizer, "_choose", counts)
-    run_stage(small_capture, run, query_device="ios", predictor={"batch_size": 1})
-    asked, following = zip(*calls, strict=True)
-    assert len(asked) == 3
-    assert [*asked[1:], []] == [*following]
-    assert len(chosen) == 3, "references are chosen once"
-
-
 def test_a_killed_run_goes_on_where_it_was(
     run: SceneFiles, finished: SceneFiles, small_capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -444,9 +419,7 @@ def test_a_killed_run_goes_on_where_it_was(
             raise KeyboardInterrupt
         return row(*args)  # type: ignore[arg-type]
 
-    def counted(
-        self: FeedForwardLocalizer, queries: Sequence[QueryInput], following: Sequence[QueryInput]
-    ) -> list[QueryPrediction]:
+    def counted(self: FeedForwardLocalizer, queries: Sequence[QueryInput]) -> list[QueryPrediction]:
         asked.extend(query.views[0].name for query, _ in queries)
         return predict(self, queries)
 
@@ -499,7 +472,7 @@ class Refuses:
     def __init__(self, error: Exception) -> None:
         self.error = error
 
-    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
         raise self.error
 
 

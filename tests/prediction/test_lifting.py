@@ -142,7 +142,7 @@ class WrongDepth:
         self.base, self.name = base, how
         self.settings: dict[str, object] = {}
 
-    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
         rng, found = np.random.default_rng(0), []
         for prediction in self.base.predict(groups):
             depth = np.array(prediction.depth)

@@ -1,7 +1,6 @@
 """VGGT as a predictor: groups, batches, the cache, memory and bad images, with a small network of its kind."""
 
 import logging
-import threading
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -327,80 +326,7 @@ def test_bfloat16_is_near_and_keeps_half_as_much(make: Make, photographs: Photog
     assert_same(again, found)
 
 
-def test_the_next_call_is_decoded_while_the_network_runs(
-    make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The network waits here until all that the next call needs has been read; one map image is encoded already."""
-    shared = photographs.view()
-    first, second = ([photographs.view(in_map=False), photographs.view(), shared] for _ in range(2))
-    expected = make(cache_bytes=0).predict([first, second])
-    read, begun, done = NetworkPredictor._read, list[Path](), threading.Semaphore(0)
-
-    def reads(predictor: NetworkPredictor, placed: Any) -> Any:
-        begun.append(placed.view.image)
-        image = read(predictor, placed)
-        if placed.view in second[:2]:
-            done.release()
-        return image
-
-    monkeypatch.setattr(NetworkPredictor, "_read", reads)
-    predictor = make()
-    forward = predictor._model.forward
-
-    def waits(*arguments: Any) -> Any:
-        assert len(begun) > 5 or (done.acquire(timeout=20) and done.acquire(timeout=20))
-        return forward(*arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(predictor._model, "forward", waits)
-        [found] = predictor.predict([first], [second])
-    assert_same(found, expected[0])
-    for view in second[:2]:
-        view.image.unlink()
-    [found] = predictor.predict([second])
-    assert_same(found, expected[1])
-    assert sorted(begun) == sorted(view.image for view in [*first, *second[:2]]), "each once"
-    assert not predictor._begun
-
-
-def test_what_was_decoded_in_vain_is_forgotten(make: Make, photographs: Photographs) -> None:
-    one, other = photographs.group(WIDE, WIDE), photographs.group(WIDE, WIDE)
-    predictor = make()
-    expected = predictor.predict([one])
-    assert_same(predictor.predict([one], [other])[0], expected[0])
-    assert len(predictor._begun) == 2
-    assert_same(predictor.predict([one])[0], expected[0])
-    assert not predictor._begun
-
-
 # Memory
-
-
-def test_fewer_views_where_memory_is_short(
-    make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    group = photographs.group(*[WIDE] * 5)
-    predictor = make()
-    [expected] = predictor.predict([group[:2]])
-    short_of_memory(predictor, monkeypatch, most=4)
-    [found] = predictor.predict([group])
-    assert "continuing with the first 2 views" in caplog.text
-    assert_only_first(found, expected, 2)
-
-
-def assert_only_first(found: Prediction, expected: Prediction, count: int) -> None:
-    """The first views are as expected, the others unknown."""
-    np.testing.assert_allclose(found.model_from_cams[:count], expected.model_from_cams, atol=2e-5)
-    assert np.isnan(found.model_from_cams[count:]).all()
-    if expected.depth is None:
-        return
-    assert found.depth is not None
-    assert found.depth_conf is not None
-    np.testing.assert_allclose(found.depth[:count], expected.depth, rtol=1e-4)
-    assert np.isnan(found.depth[count:]).all()
-    assert not np.any(found.depth_conf[count:])
-    for view in range(count, len(found.depth)):
-        assert np.isnan(found.depth_at(view, [[50.0, 40.0]])).all()
 
 
 def short_of_memory(predictor: NetworkPredictor, monkeypatch: pytest.MonkeyPatch, most: int) -> list[tuple[int, int]]:
@@ -420,53 +346,22 @@ def short_of_memory(predictor: NetworkPredictor, monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.slow
 def test_what_does_not_fit_after_all_is_halved(
-    make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     groups = [photographs.group(*[WIDE] * 4) for _ in range(6)]
     predictor = make(batch_size=4)
     expected = predictor.predict(groups)
-    two = predictor.predict([group[:2] for group in groups])
     shapes = short_of_memory(predictor, monkeypatch, most=8)
     for found, other in zip(predictor.predict(groups), expected, strict=True):
         assert_same(found, other)
     assert shapes == [(4, 4), (2, 4), (2, 4), (2, 4)], "what did not fit is not tried again"
-    shapes = short_of_memory(predictor, monkeypatch, most=3)
-    caplog.clear()
-    for found, other in zip(predictor.predict(groups), two, strict=True):
-        assert_only_first(found, other, 2)
-    assert "continuing with the first 2 views" in caplog.text
-    assert shapes[:4] == [(2, 4), (1, 4), (4, 2), (2, 2)]
-    assert shapes[4:] == [(1, 2)] * 6
 
 
-def test_memory_for_not_even_two_views(make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_for_not_even_one_group(make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch) -> None:
     predictor = make()
     short_of_memory(predictor, monkeypatch, most=1)
-    with pytest.raises(ToolkitError, match="does not hold VGGT with 2 views of 518 x 112 pixels"):
+    with pytest.raises(ToolkitError, match="one of the groups of 3 views of 518 x 112 pixels"):
         predictor.predict([photographs.group(WIDE, WIDE, WIDE)])
-
-
-# Compiled
-
-
-@pytest.mark.slow
-def test_compiled_blocks_give_the_same(make: Make, photographs: Photographs) -> None:
-    groups = [photographs.group(*sizes) for sizes in ([WIDE] * 3, [WIDE] * 4, [HIGHER, WIDE])]
-    expected = make().predict(groups)
-    for found, other in zip(make(compile=True).predict(groups), expected, strict=True):
-        assert_same(found, other)
-
-
-def test_what_does_not_compile_says_so_at_the_start(
-    make: Make, photographs: Photographs, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fails(*_: Any) -> Any:
-        raise RuntimeError("InvalidCxxCompiler: no g++\nand much more")
-
-    monkeypatch.setattr(VGGT, "compile_blocks", lambda _: None)
-    monkeypatch.setattr(VGGT, "forward", fails)
-    with pytest.raises(ToolkitError, match=r"cannot compile VGGT on cpu \(.*no g\+\+\)\. Use localize"):
-        make(compile=True).predict([photographs.group(WIDE, WIDE)])
 
 
 # What is wrong with files

@@ -56,9 +56,9 @@ def test_a_network_that_the_run_did_not_have_sees_the_query_as_upright_as_its_re
     predict, seen = SimulatedPredictor.predict, list[int]()
 
     class Seeing(SimulatedPredictor):
-        def predict(self, groups: Any, following: Any = ()) -> Any:
+        def predict(self, groups: Any) -> Any:
             seen.extend(view.turns for group in groups for view in group)
-            return predict(self, groups, following)
+            return predict(self, groups)
 
     monkeypatch.setattr(predictors, "SimulatedPredictor", Seeing)
     again = asking(small_capture, finished, settings=LocalizeSettings())

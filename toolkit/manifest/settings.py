@@ -446,9 +446,6 @@ class PredictorSettings(Settings):
     """Map images that the network receives with each query image."""
     batch_size: Positive = 4
     """Query devices per batch. Poses do not depend on it."""
-    compile: bool = False
-    """Compile the network with `torch.compile`: takes a minute or more at the start of each run and, on a CPU, needs a
-    C++ compiler. Changes only the rounding."""
 
 
 Method = Annotated[

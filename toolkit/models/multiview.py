@@ -21,7 +21,7 @@ from torch.nn import functional as F
 from toolkit.capture.images import HEADER_ERRORS, open_lazily, read_file
 from toolkit.errors import ImageError
 from toolkit.geometry import Floats, Ints, quaternion_to_rotation
-from toolkit.models.vit import PATCH, Block
+from toolkit.models.vit import PATCH
 from toolkit.models.weights import load_checkpoint
 
 Source = str | Path | Image.Image | NDArray[np.uint8]
@@ -252,12 +252,6 @@ class MultiView(nn.Module):
     def channels(self) -> int:
         """Channels of a token."""
         return int(self.aggregator.camera_token.shape[-1])
-
-    def compile_blocks(self) -> None:
-        """Compile the blocks with `torch.compile` at their first run, for images of any size."""
-        for module in self.modules():
-            if isinstance(module, Block):
-                module.compile(dynamic=True)
 
     @torch.no_grad()
     def encode(self, images: Tensor) -> Tensor:

@@ -173,18 +173,11 @@ class Localizer:
     image_names: list[str]
     """Names of the map images; references hold indices into this list."""
 
-    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[Any]:
+    def predict(self, queries: Sequence[QueryInput]) -> list[Any]:
         """Return a network's prediction for each query, or None for each if the method uses no network.
 
-        Not thread-safe.
-
-        Args:
-            queries: queries with the references of their images.
-            following: the queries of the next call; their images are decoded while the network runs.
-
-        Raises:
-            ToolkitError: a problem of all queries: the device does not exist, the weights are of another network, or
-                the memory is too small.
+        Not thread-safe. Raise ToolkitError for a problem of all queries: the device does not exist, the weights are of
+        another network, or the memory is too small.
         """
         return [None] * len(queries)
 

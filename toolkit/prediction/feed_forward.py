@@ -74,10 +74,6 @@ class FeedForwardAnswer:
     cameras: tuple[CameraAnswer, ...] = ()
 
 
-_Groups = tuple[list[list[Ints]], dict[tuple[int, int], list[View]]]
-"""References chosen for each image of each query, and groups of views, keyed by query and image."""
-
-
 class FeedForwardLocalizer(Localizer):
     """Localizes queries in one map by predicted cameras."""
 
@@ -100,8 +96,6 @@ class FeedForwardLocalizer(Localizer):
         self.seen_depth = depth_of_images(session, local_map.image_names, length)
         self._upright = turns is not None
         self._turns = np.zeros(len(session.images), np.int64) if turns is None else turns.of(session)
-        self._next: tuple[Sequence[QueryInput], _Groups] = (), ([], {})
-        """Queries expected in the next call of `predict`, and their groups."""
         self.image_names, self.batch_size = local_map.image_names, self.settings.batch_size
 
     @fixed_sums
@@ -126,19 +120,15 @@ class FeedForwardLocalizer(Localizer):
         cameras = tuple(self._camera_answer(*image) for image in images)
         return FeedForwardAnswer(_combine(query, cameras, self.image_names), cameras)
 
-    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[QueryPrediction]:
+    def predict(self, queries: Sequence[QueryInput]) -> list[QueryPrediction]:
         """Return the predictions for each query, made in one call of the predictor; see `Localizer`.
 
         `localize` aligns them to the map, in other threads while the network continues. An error in one query is not
         raised and does not affect the others; one of all queries is, such as of the device, weights or memory, see
         `errors.reason_of`.
         """
-        expected, expected_groups = self._next
-        same = [id(query.views) for query, _ in queries] == [id(query.views) for query, _ in expected]
-        chosen, groups = expected_groups if same else self._groups(queries)
-        next_groups = self._groups(following)
-        self._next = following, next_groups
-        results = self._predict(list(groups.values()), list(next_groups[1].values()))
+        chosen, groups = self._groups(queries)
+        results = self._predict(list(groups.values()))
         predictions = dict(zip(groups, results, strict=True))
         return [
             QueryPrediction(
@@ -148,7 +138,7 @@ class FeedForwardLocalizer(Localizer):
             for number, references in enumerate(chosen)
         ]
 
-    def _groups(self, queries: Sequence[QueryInput]) -> _Groups:
+    def _groups(self, queries: Sequence[QueryInput]) -> tuple[list[list[Ints]], dict[tuple[int, int], list[View]]]:
         chosen = [[self._choose(retrieved) for retrieved in references] for _, references in queries]
         groups = {
             (number, camera): [self._as_shown(query.views[camera]), *(self.view(int(index)) for index in references)]
@@ -187,10 +177,10 @@ class FeedForwardLocalizer(Localizer):
         )
         return candidates[chosen]
 
-    def _predict(self, groups: list[list[View]], following: Sequence[list[View]] = ()) -> list[Prediction | str]:
+    def _predict(self, groups: list[list[View]]) -> list[Prediction | str]:
         """Return a prediction per group, or the reason why there is none."""
         try:
-            return [*self.predictor.predict(groups, following)] if groups else []
+            return [*self.predictor.predict(groups)] if groups else []
         except Exception as error:  # one bad query must not end a run; the groups are tried one by one
             if len(groups) == 1:
                 return [reason_of(error, f"predicting {groups[0][0].name}")]

@@ -25,9 +25,9 @@ class HybridLocalizer(Localizer):
         self.image_names, self.batch_size = pnp.image_names, feed_forward.batch_size
         self._index_of = {name: index for index, name in enumerate(self.image_names)}
 
-    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[QueryPrediction]:
+    def predict(self, queries: Sequence[QueryInput]) -> list[QueryPrediction]:
         """Return the prediction of the network for each query; see `Localizer`."""
-        return self.feed_forward.predict(queries, following)
+        return self.feed_forward.predict(queries)
 
     def match(self, query: Query, references: Sequence[References]) -> PnpMatches:
         """Return the matches of a query with its references; see `Localizer`."""

@@ -70,10 +70,5 @@ class Predictor(Protocol):
     def settings(self) -> dict[str, Any]:
         """Everything besides the views that the predictions depend on; part of the fingerprint of the poses."""
 
-    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
-        """Return a prediction for each group of views; groups do not influence each other.
-
-        Args:
-            groups: each holds the query view first, then its references.
-            following: probable groups of the next call; their images may be read in the meantime.
-        """
+    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
+        """Return a prediction for each group of views, the query's first; groups do not influence each other."""

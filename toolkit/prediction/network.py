@@ -3,9 +3,7 @@
 import logging
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property, partial
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +13,7 @@ from numpy.typing import NDArray
 from toolkit.capture import Capture
 from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.capture.upright import turn_image, turned_from_cam
-from toolkit.errors import ImageError, ManifestError, ToolkitError, first_line
+from toolkit.errors import ImageError, ManifestError
 from toolkit.files import files_fingerprint
 from toolkit.geometry import invert, make_pose
 from toolkit.manifest import LocalizeSettings
@@ -30,15 +28,12 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    _Begun = dict[Any, Future[Tensor | ImageError]]
-
 log = logging.getLogger(__name__)
 
 CACHE_BYTES = 2 << 30
 """Size of the cache for encodings of map images: 500 of them at 518 x 392 in float32, twice as many in bfloat16."""
 _GROUPS_AT_A_TIME = 8  # on a CPU 1: one group keeps it busy, and a batch needs more memory and is not faster
 _IMAGES_AT_A_TIME = 8
-_LEAST_VIEWS = 2  # the query and one reference
 
 
 def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) -> Predictor:
@@ -53,7 +48,6 @@ def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) 
             settings.compute_device,
             settings.dtype_compute,
             architecture=ARCHITECTURES[predictor.name],
-            compile=predictor.compile,
         )
     log.warning("predictor: simulated looks up the true poses of the queries. Its poses are no results.")
     sessions = [*capture.usable("map"), *capture.usable("query")]
@@ -102,7 +96,6 @@ class NetworkPredictor:
         batch_size: int | None = None,
         cache_bytes: int = CACHE_BYTES,
         architecture: Architecture = ARCHITECTURES["vggt"],
-        compile: bool = False,  # noqa: A002
     ) -> None:
         """Find the weights: the file `checkpoint`, else the hub's, which is downloaded if need be.
 
@@ -111,7 +104,6 @@ class NetworkPredictor:
                 overflow it; `auto` takes float32 where it would choose float16. The heads always run in float32.
             batch_size: largest number of groups per batch; None takes a default for the device.
             cache_bytes: memory of the CPU for encodings of map images.
-            compile: see `PredictorSettings`.
 
         Raises:
             ManifestError: the precision does not exist or is float16.
@@ -125,12 +117,8 @@ class NetworkPredictor:
         self.checkpoint = resolve_weights(architecture.weights, checkpoint)
         self.compute_device, self.dtype_compute = compute_device, dtype_compute
         self._batch_size = batch_size
-        self._compile = compile
         self._cache = TokenCache(cache_bytes)
         self._fitting: dict[tuple[int, Size], Fitting] = {}
-        self._most_views: dict[Size, int] = {}
-        self._begun: _Begun = {}
-        """Images of the next call that are being decoded, by key."""
 
     @cached_property
     def settings(self) -> dict[str, Any]:
@@ -152,29 +140,22 @@ class NetworkPredictor:
 
     @cached_property
     def _model(self) -> Any:
-        return _load_network(self._architecture, self.checkpoint, self._dtype, self._device, self._compile)
+        return _load_network(self._architecture, self.checkpoint, self._dtype, self._device)
 
-    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
         """Return a prediction for each group of views. The first view of a group is the query.
 
-        A prediction has as many views as its group. Views that the network did not get have NaN in `model_from_cams`
-        and `depth`, and 0 in `depth_conf`. The log says why:
-
-        - The file is missing, cannot be decoded, or does not have the size of its camera. If this is the query, the
-          whole prediction is NaN, without depth, and gives the reason.
-        - The group alone does not fit the memory; then it is halved, and its last references are left out.
-
-        No other error is raised for a group, and groups do not influence each other. Groups with equal numbers of views
-        and equal image size run in one batch. A batch that does not fit the memory is halved.
-
-        The first images of the `following` groups, those of the next call, are decoded while the network runs.
+        A prediction has as many views as its group. Views that the network did not get, because the file is missing,
+        cannot be decoded, or does not have the size of its camera, have NaN in `model_from_cams` and `depth`, and 0 in
+        `depth_conf`; the log says why. If this is the query, the whole prediction is NaN, without depth, and gives the
+        reason. Groups do not influence each other: those with equal numbers of views and equal image size run in one
+        batch, which is halved if it does not fit the memory.
 
         Raises:
             WeightsError: at the first call, the file does not belong to this network.
-            ToolkitError: the device does not exist, or its memory does not hold a query and one reference.
+            ToolkitError: the device does not exist, or its memory does not hold a group.
         """
         placed = [self._place(group) if group else [] for group in groups]
-        begun, self._begun = self._begun, self._read_ahead(placed, following)
         results = [_nothing(len(group)) for group in groups]
         alike: dict[tuple[int, Size], list[int]] = {}
         for number, group in enumerate(placed):
@@ -183,7 +164,7 @@ class NetworkPredictor:
         batch_size = self._batch_size or (1 if self._device.type == "cpu" else _GROUPS_AT_A_TIME)
         for numbers in alike.values():
             batches = [numbers[start : start + batch_size] for start in range(0, len(numbers), batch_size)]
-            encoded = self._encoded([[placed[number] for number in batch] for batch in batches], begun)
+            encoded = self._encoded([[placed[number] for number in batch] for batch in batches])
             for batch, tokens in zip(batches, encoded, strict=True):
                 self._run(batch, [placed[number] for number in batch], tokens, results)
         return results
@@ -193,31 +174,15 @@ class NetworkPredictor:
         layout = self._architecture.lay_out([shown_size(view) for view in group])
         return [PlacedView(view, layout, number) for number, view in enumerate(group)]
 
-    def _read_ahead(self, groups: Sequence[list[PlacedView]], following: Sequence[Sequence[View]]) -> "_Begun":
-        """Start to decode the first images of the following groups, except those whose encoding will be cached."""
-        encoded = {placed.key for group in groups for placed in group if placed.view.in_map}
-        views = {placed.key: placed for group in following if group for placed in self._place(group)}
-        new = (key for key in views if isinstance(key[0], Path) and key not in encoded and key not in self._cache)
-        pool = ThreadPoolExecutor(workers := default_workers())
-        begun = {key: pool.submit(self._read, views[key]) for key in islice(new, workers + _IMAGES_AT_A_TIME)}
-        pool.shutdown(wait=False)
-        return begun
-
-    def _encoded(
-        self, batches: Sequence[Sequence[Sequence[PlacedView]]], begun: "_Begun"
-    ) -> "Iterator[dict[Any, Tensor | str]]":
+    def _encoded(self, batches: Sequence[Sequence[Sequence[PlacedView]]]) -> "Iterator[dict[Any, Tensor | str]]":
         """Yield, per batch, the tokens (P, C) of its views by key, or the reason why a view cannot be read.
 
         Other threads decode the next images in the meantime, except those whose encoding is cached.
         """
 
-        def read(placed: PlacedView) -> "Tensor | ImageError":
-            future = begun.pop(placed.key, None)
-            return future.result() if future else self._read(placed)
-
         views = {placed.key: placed for batch in batches for group in batch for placed in group}
         unread = {key: placed for key, placed in views.items() if key not in self._cache}
-        decoded = prefetch(read, list(unread.values()), workers=default_workers(), ahead=_IMAGES_AT_A_TIME)
+        decoded = prefetch(self._read, list(unread.values()), workers=default_workers(), ahead=_IMAGES_AT_A_TIME)
         for batch in batches:
             tokens: dict[Any, Tensor | str] = {}
             waiting: dict[Any, tuple[PlacedView, Tensor]] = {}
@@ -294,27 +259,18 @@ class NetworkPredictor:
         for rows in alike.values():
             output = self._forward(torch.stack([stacked for *_, stacked in rows]), rows[0][1][0].size).numpy()
             for (number, group, shown, _), values in zip(rows, output, strict=True):
-                results[number] = self._prediction(group, shown[: len(values)], values)
+                results[number] = self._prediction(group, shown, values)
 
     def _forward(self, tokens: "Tensor", size: Size) -> "Tensor":
-        """Return outputs (B, S, 9 + 2 H W) on the CPU for tokens (B, S, P, C); S shrinks if the memory is too small."""
+        """Return outputs (B, S, 9 + 2 H W) on the CPU for tokens (B, S, P, C) of images (H, W)."""
         import torch
 
-        while True:
-            views = min(tokens.shape[1], self._most_views.get(size, tokens.shape[1]))
-            what = f"groups of {views} views"
-            run = self._fitting.setdefault((views, size), Fitting(partial(self._heads, size), what, self._device))
-            try:
-                with torch.inference_mode():
-                    return run(tokens[:, :views])
-            except ToolkitError as error:
-                if views <= _LEAST_VIEWS:
-                    raise ToolkitError(
-                        f"The memory of {self._device} does not hold {self._architecture.title} with {views} views of "
-                        f"{size[1]} x {size[0]} pixels. Use dtype_compute: bfloat16, or compute_device: cpu."
-                    ) from error
-            self._most_views[size] = max(_LEAST_VIEWS, views // 2)
-            log.warning("continuing with the first %d views of each group", self._most_views[size])
+        what = (
+            f"groups of {tokens.shape[1]} views of {size[1]} x {size[0]} pixels (`localize.predictor.num_references`)"
+        )
+        run = self._fitting.setdefault((tokens.shape[1], size), Fitting(partial(self._heads, size), what, self._device))
+        with torch.inference_mode():
+            return run(tokens)
 
     def _heads(self, size: Size, tokens: "Tensor") -> "Tensor":
         """Return the network's outputs (B, S, 9 + 2 H W) on the CPU for tokens (B, S, P, C) of images (H, W)."""
@@ -355,35 +311,15 @@ def _load_network(
     checkpoint: Path,
     dtype: "torch.dtype",
     device: "torch.device",
-    compiled: bool,
 ) -> Any:
     """Return a network, ready to run. The last one stays loaded: a notebook that inspects a query after a run creates a
     new predictor, and loading gigabytes of weights again would be slow.
     """
-    key = (checkpoint.resolve(), files_fingerprint([checkpoint]), architecture.name, dtype, device, compiled)
+    key = (checkpoint.resolve(), files_fingerprint([checkpoint]), architecture.name, dtype, device)
     if key not in _loaded:
         _loaded.clear()  # before loading, as the memory may hold only one network
-        network = on_device(architecture.load(checkpoint, dtype), device, architecture.title)
-        if compiled:
-            _compile(network, architecture, device)
-        _loaded[key] = network
+        _loaded[key] = on_device(architecture.load(checkpoint, dtype), device, architecture.title)
     return _loaded[key]
-
-
-def _compile(network: Any, architecture: Architecture, device: "torch.device") -> None:
-    """Compile the blocks of a network and run them once, so that compilation fails before the first query."""
-    import torch
-
-    network.compile_blocks()
-    side = 2 * network.patch
-    try:
-        with torch.inference_mode():
-            network(torch.zeros(1, _LEAST_VIEWS, 3, side, side, device=device), ("camera",))
-    except Exception as error:  # torch, its compilers and the programs that they call raise anything
-        raise ToolkitError(
-            f"torch cannot compile {architecture.title} on {device} ({first_line(error)}). Use "
-            "localize.predictor.compile: false."
-        ) from error
 
 
 def _nothing(views: int, reason: str = "") -> Prediction:

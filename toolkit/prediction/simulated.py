@@ -89,7 +89,7 @@ class SimulatedPredictor:
             for name, pose in zip(session.image_names, session.world_from_cam(ground_truth=True), strict=True)
         }
 
-    def predict(self, groups: Sequence[Sequence[View]], following: Sequence[Sequence[View]] = ()) -> list[Prediction]:
+    def predict(self, groups: Sequence[Sequence[View]]) -> list[Prediction]:
         """Return a prediction for each group of views; raise CaptureError if the true pose of a view is unknown."""
         return [self._predict(list(group)) for group in groups]
 

@@ -356,11 +356,9 @@ class Map:
             return self.retry(self._with_fallback_features(query), references, result, priors)
         return result
 
-    def predict(self, queries: Sequence[QueryInput], following: Sequence[QueryInput] = ()) -> list[Any]:
+    def predict(self, queries: Sequence[QueryInput]) -> list[Any]:
         """Return a network's prediction for each query, for `locate`; see `Localizer.predict`."""
-        inputs = ([(query.scaled(1 / self.length), references) for query, references in part]
-                  for part in (queries, following))  # fmt: skip
-        return self.localizer.predict(*inputs)
+        return self.localizer.predict([(query.scaled(1 / self.length), references) for query, references in queries])
 
     def is_unsure(self, result: QueryResult) -> bool:
         """Tell whether fallback features, if there are any, might find a better pose."""
