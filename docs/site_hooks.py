@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from toolkit.manifest import STAGES, Manifest
-from toolkit.manifest.messages import nested_model
-from toolkit.manifest.settings import Settings
+from toolkit.manifest.settings import Settings, nested_model
 
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig

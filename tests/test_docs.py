@@ -25,7 +25,7 @@ from toolkit.files import SceneFiles
 from toolkit.geometry import pose_error
 from toolkit.localize import localize_pairs
 from toolkit.manifest import STAGES, Manifest, load_manifest
-from toolkit.manifest.messages import nested_model
+from toolkit.manifest.settings import nested_model
 from toolkit.notebook import notebook_parameters
 from toolkit.retrieve import retrieve_pairs
 

@@ -20,7 +20,7 @@ from toolkit.manifest import (
     load_manifest,
 )
 from toolkit.manifest import settings as settings_module
-from toolkit.manifest.messages import nested_model
+from toolkit.manifest.settings import nested_model
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 MANIFESTS = sorted((REPOSITORY / "data_manifests").glob("*.yaml"))

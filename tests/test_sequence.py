@@ -26,8 +26,7 @@ from toolkit.sequence import COLUMNS, sequence_pairs
 from toolkit.sequences.pose_graph import FAR
 from toolkit.synthetic import capture as rendering
 from toolkit.synthetic import render_capture
-from toolkit.synthetic.devices import DEVICES
-from toolkit.synthetic.recording import PICTURE_S, RATE_HZ, tracked
+from toolkit.synthetic.devices import DEVICES, PICTURE_S, RATE_HZ, tracked
 from toolkit.synthetic.scene import Scene, build_room
 
 pytest.importorskip("gtsam")

@@ -243,7 +243,7 @@ def compare(
 def settings(branch: Annotated[str, Argument(help="Only these, e.g. localize or localize.pnp.")] = "") -> None:
     """Show all settings of a manifest with their meanings and defaults, as YAML to copy into a manifest."""
     from toolkit.manifest import Manifest, describe, nearest
-    from toolkit.manifest.messages import nested_model
+    from toolkit.manifest.settings import nested_model
 
     model: Any = Manifest
     keys = branch.split(".") if branch else []

@@ -48,7 +48,7 @@ from toolkit.manifest import (
     Settings,
     nearest,
 )
-from toolkit.manifest.messages import explain
+from toolkit.manifest.settings import explain
 from toolkit.runs.folder import LOG_VARIABLE, RECORD, counts_text, log_to
 from toolkit.runs.kernel import TEXT_BARS, Kernels, MemoryWatch, kernel_error
 from toolkit.runs.pairs import left_out_of

@@ -49,8 +49,7 @@ from toolkit.sequences.odometry import (
     vote_weights,
     with_measured_drift,
 )
-from toolkit.sequences.piece import localize_piece
-from toolkit.sequences.pose_graph import place_online
+from toolkit.sequences.pose_graph import localize_piece, place_online
 from toolkit.threads import fixed_sums
 
 log = logging.getLogger(__name__)

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
-from toolkit.alignment.pose_mean import PoseMean, robust_mean_pose
+from toolkit.alignment.robust import PoseMean, robust_mean_pose
 from toolkit.alignment.similarity import AlignmentError
 
 NOISE = np.diag([np.radians(1.0) ** 2 / 3] * 3 + [0.05**2 / 3] * 3)

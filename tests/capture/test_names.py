@@ -24,7 +24,7 @@ from toolkit.capture.names import (
 )
 from toolkit.embed import embed_sessions
 from toolkit.errors import CaptureError, ManifestError
-from toolkit.exchange.archives import arrange
+from toolkit.exchange.download import arrange
 from toolkit.exchange.interchange import import_images
 from toolkit.features.stores import extract_session
 from toolkit.manifest import load_manifest

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from toolkit.capture import Capture, Session, Trajectory, write_session
-from toolkit.capture.upright import quarter_turns, turned_from_cam
-from toolkit.capture.world_up import estimate_world_up, up_of_cameras
+from toolkit.capture.upright import estimate_world_up, quarter_turns, turned_from_cam, up_of_cameras
 from toolkit.errors import CaptureError
 from toolkit.geometry import invert, make_pose
 
@@ -156,7 +155,7 @@ def test_all_cameras_rolled_leave_the_sign_to_a_guess(write: Write) -> None:
 def test_many_images_of_many_sessions_are_sampled_over_all_cameras(
     write: Write, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("toolkit.capture.world_up.MAX_IMAGES", 30)
+    monkeypatch.setattr("toolkit.capture.upright.MAX_IMAGES", 30)
     # Every third image is of the rolled camera: a plain stride of 3 would see no other.
     a, b, c = (_frames(f"r/{name}", k, count=60, seed=k) for name, k in (("a", 1), ("b", 0), ("c", 0)))
     mixed = [frame for triple in zip(a, b, c, strict=True) for frame in triple]

@@ -26,10 +26,9 @@ from tests.fake_hub import FakeHub, serving, use_hub
 from toolkit import pipeline
 from toolkit.capture import Capture
 from toolkit.errors import COMMAND, CaptureError, DownloadError, ManifestError, sentence
-from toolkit.exchange import archives
+from toolkit.exchange import download as archives
 from toolkit.exchange import download as module
-from toolkit.exchange.archives import arrange, unpack
-from toolkit.exchange.download import download, is_unfinished
+from toolkit.exchange.download import arrange, download, is_unfinished, unpack
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 REPO = "Someone/PLACE-challenge-test"

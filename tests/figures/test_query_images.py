@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from tests.displayed import picture_of
-from toolkit.capture.world_up import up_of_cameras
+from toolkit.capture.upright import up_of_cameras
 from toolkit.figures.query_images import WorstQuery, draw_localization, draw_worst
 from toolkit.figures.style import error_colors, new_figure, save_figure
 from toolkit.figures.top_view import draw_scene

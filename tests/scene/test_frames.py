@@ -21,8 +21,7 @@ from toolkit.scene import frames
 from toolkit.scene.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
 from toolkit.scene.map import Map
 from toolkit.sequences.odometry import Odometry
-from toolkit.sequences.piece import queries_of
-from toolkit.sequences.pose_graph import place_piece
+from toolkit.sequences.pose_graph import place_piece, queries_of
 
 pytest.importorskip("gtsam")
 CAMERA = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[500, 500, 320, 240])

@@ -20,7 +20,7 @@ from toolkit.pose.result import QueryResult, Rival, Status
 from toolkit.runs.kernel import TEXT_BARS
 from toolkit.scene.inspection import InspectedPair
 from toolkit.scene.map import Map
-from toolkit.viewer.scene_view import View3D
+from toolkit.viewer.inline import View3D
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from toolkit.manifest import SequenceSettings
 from toolkit.pose.base import RoughPose
 from toolkit.pose.result import QueryResult, Status
 from toolkit.sequences.odometry import PosedQueries
-from toolkit.sequences.piece import STEPS, localize_piece, with_relocalized
+from toolkit.sequences.pose_graph import STEPS, localize_piece, with_relocalized
 
 pytest.importorskip("gtsam")
 SETTINGS = SequenceSettings()

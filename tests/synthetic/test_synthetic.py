@@ -24,8 +24,17 @@ from toolkit.geometry import invert, make_pose, rotation_angle_deg, transform
 from toolkit.synthetic import capture as capture_writing
 from toolkit.synthetic import render_capture, textures
 from toolkit.synthetic.capture import HARD, WRONG_FOCAL, World
-from toolkit.synthetic.devices import DEVICES, Sensor, looking, walks
-from toolkit.synthetic.recording import Emitter, emitters_of, odometry_of, received, scans
+from toolkit.synthetic.devices import (
+    DEVICES,
+    Emitter,
+    Sensor,
+    emitters_of,
+    looking,
+    odometry_of,
+    received,
+    scans,
+    walks,
+)
 from toolkit.synthetic.render import Rays, paint, render
 from toolkit.synthetic.scene import Quad, Scene, build_room
 

@@ -17,7 +17,7 @@ from toolkit.capture.images import default_workers, prefetch, read_image, stored
 from toolkit.capture.names import HOW_TO_ALLOW, has_long_part
 from toolkit.capture.session import RAW_DATA, SUBSESSIONS, Session
 from toolkit.capture.tables import ALIGNED, COLUMNS, POSE_NAMES, SIGNALS, KeyIndex, key_of, read_table, times_of
-from toolkit.capture.world_up import estimate_world_up, posed_photographs
+from toolkit.capture.upright import estimate_world_up, posed_photographs
 from toolkit.capture.writing import read_depth
 from toolkit.errors import COMMAND, CaptureError, ImageError
 from toolkit.files import read_json

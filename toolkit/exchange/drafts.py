@@ -42,7 +42,7 @@ from toolkit.capture.images import (
 )
 from toolkit.capture.names import EXPECTED_NAME, has_long_part, is_bad_name, is_linked_here, note_linked_here
 from toolkit.capture.tables import COLUMNS, write_table
-from toolkit.capture.world_up import up_of_cameras
+from toolkit.capture.upright import up_of_cameras
 from toolkit.capture.writing import read_depth, write_depth
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.georeference import alignment, gps_position, quarter_turns, read_positions

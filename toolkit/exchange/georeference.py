@@ -12,7 +12,7 @@ import pycolmap
 from toolkit.capture import Session
 from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.images import HEADER_ERRORS, ORIENTATION, read_number
-from toolkit.capture.world_up import up_of_cameras
+from toolkit.capture.upright import up_of_cameras
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.recordings import numbers_in, read_csv
 from toolkit.files import own_name, read_json

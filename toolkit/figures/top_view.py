@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from toolkit.capture.world_up import up_of_cameras
+from toolkit.capture.upright import up_of_cameras
 from toolkit.figures.style import ESTIMATED, MAP, TRUE, error_bar, error_colors, new_figure, shared_legend, styled
 from toolkit.geometry import Floats, Ints
 from toolkit.results.metrics import is_posed

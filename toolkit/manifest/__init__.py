@@ -2,7 +2,6 @@
 
 from toolkit.manifest.loading import find_manifest, load_manifest
 from toolkit.manifest.manifest import OPTIONAL, STAGES, DatasetSettings, DemoData, Manifest, Source
-from toolkit.manifest.messages import nearest
 from toolkit.manifest.settings import (
     AUTO,
     AlikedModel,
@@ -27,4 +26,5 @@ from toolkit.manifest.settings import (
     VisualizeSettings,
     checkpoint_of,
     describe,
+    nearest,
 )

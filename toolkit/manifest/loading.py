@@ -13,8 +13,7 @@ from pydantic import ValidationError
 from toolkit.errors import ManifestError
 from toolkit.files import RUN_FILES, shipped, write_text
 from toolkit.manifest.manifest import Manifest
-from toolkit.manifest.messages import explain, nearest
-from toolkit.manifest.settings import expand, merge
+from toolkit.manifest.settings import expand, explain, merge, nearest
 
 PATHS = ("captures", "output_root", "retrieve.mask.poses")
 """Keys whose values are paths; the keys of checkpoints are paths too."""

@@ -6,7 +6,6 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from toolkit.capture.devices import TABLE
-from toolkit.manifest.messages import nearest
 from toolkit.manifest.settings import (
     Direction,
     EmbedSettings,
@@ -23,6 +22,7 @@ from toolkit.manifest.settings import (
     Share,
     Unit,
     VisualizeSettings,
+    nearest,
 )
 
 STAGES = ("explore", "embed", "retrieve", "rerank", "localize", "sequence", "evaluate", "visualize")

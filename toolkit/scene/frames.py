@@ -18,8 +18,7 @@ from toolkit.pose.result import QueryResult, Status, carried_over
 from toolkit.scene.map import Map, localize_image
 from toolkit.scene.query import Image
 from toolkit.sequences.odometry import Odometry, cut, with_measured_drift
-from toolkit.sequences.piece import localize_piece, queries_of
-from toolkit.sequences.pose_graph import FAR, PlacedPiece, is_sure
+from toolkit.sequences.pose_graph import FAR, PlacedPiece, is_sure, localize_piece, queries_of
 from toolkit.threads import fixed_sums
 
 Images = Image | Sequence[Image] | None

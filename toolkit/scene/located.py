@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from toolkit.figures.answers import Answer, Comparison
-    from toolkit.viewer.scene_view import View3D
+    from toolkit.viewer.inline import View3D
 
 Map = Any
 """A `scene.map.Map`, which imports this module."""
@@ -77,7 +77,7 @@ class Located:
 
     def show_3d(self, results: Sequence[QueryResult], rays: bool = False) -> "View3D":
         """See `QueryResult.show_3d`."""
-        from toolkit.viewer.scene_view import View3D
+        from toolkit.viewer.inline import View3D
 
         return View3D.of([result.show() for result in results], rays)
 

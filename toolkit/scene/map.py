@@ -79,7 +79,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from toolkit.figures.answers import Answer
-    from toolkit.viewer.scene_view import View3D
+    from toolkit.viewer.inline import View3D
 
 log = logging.getLogger(__name__)
 
@@ -289,7 +289,7 @@ class Map:
 
     def show_3d(self) -> "View3D":
         """Return the map in 3D: points and cameras; see `QueryResult.show_3d`."""
-        from toolkit.viewer.scene_view import View3D
+        from toolkit.viewer.inline import View3D
 
         return View3D([], False, self.session, self.points, self.settings.world_up, length_unit(self.record()))
 

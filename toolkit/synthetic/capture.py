@@ -22,8 +22,19 @@ from toolkit.errors import CaptureError
 from toolkit.files import read_json, write_folder
 from toolkit.geometry import Floats, invert, pose_from_qt
 from toolkit.manifest import DemoData
-from toolkit.synthetic.devices import DEVICES, Device, Sensor, walks
-from toolkit.synthetic.recording import PICTURE_S, RADIOS, RATE_HZ, emitters_of, every_frame, scans, tracked
+from toolkit.synthetic.devices import (
+    DEVICES,
+    PICTURE_S,
+    RADIOS,
+    RATE_HZ,
+    Device,
+    Sensor,
+    emitters_of,
+    every_frame,
+    scans,
+    tracked,
+    walks,
+)
 from toolkit.synthetic.render import Rays, paint, render
 from toolkit.synthetic.scene import Quad, Scene, build_room, named_rng
 from toolkit.synthetic.textures import Image, Rng

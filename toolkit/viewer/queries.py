@@ -14,7 +14,7 @@ import rerun.blueprint as rrb
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.images import prefetch, read_for_display
-from toolkit.capture.world_up import up_of_cameras
+from toolkit.capture.upright import up_of_cameras
 from toolkit.figures.scene_3d import pyramids
 from toolkit.figures.style import ESTIMATED, GREEN, MAP, ORANGE, SKY, TRUE, draw_error_legend, error_colors
 from toolkit.geometry import Floats, local_origin, project, rotation_to_quaternion, shifted

@@ -18,7 +18,7 @@ from tqdm.auto import tqdm
 from toolkit.capture import DEPTH_SCALE, RAW_DATA, Capture, Session, Trajectory
 from toolkit.capture.devices import color_of
 from toolkit.capture.images import decode, default_workers, prefetch, read_for_display, read_image
-from toolkit.capture.world_up import up_of_cameras
+from toolkit.capture.upright import up_of_cameras
 from toolkit.errors import ArtifactError, CaptureError, ImageError
 from toolkit.figures.style import ORANGE
 from toolkit.files import pair_devices, write_sidecar
