@@ -582,10 +582,8 @@ def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:
     """Return the rows of a file of references, one per query image.
 
     A row has at least `timestamp` (an integer), `sensor_id`, and `topk`, a list of map images, each with a `path`, and
-    the `needed` keys. Rows written by the toolkit have all keys described in the retrieve stage.
-
-    Raises:
-        ArtifactError: the file is missing or damaged, or a line is not such a row.
+    the `needed` keys. Rows written by the toolkit have all keys described in the retrieve stage. Raise ArtifactError if
+    the file is missing or damaged, or a line is not such a row.
     """
     rows: list[dict[str, Any]] = []
     number = 0

@@ -31,8 +31,7 @@ def rounded(values: NDArray[Any], step: float) -> NDArray[np.float32]:
 def quaternion_to_rotation(qwxyz: ArrayLike) -> Floats:
     """Return the rotation matrices (..., 3, 3) of quaternions (..., 4) of any length.
 
-    Raises:
-        ValueError: wrong shape, or a quaternion is zero or not finite.
+    Raise ValueError if the shape is wrong, or a quaternion is zero or not finite.
     """
     q = np.asarray(qwxyz, np.float64)
     if q.shape[-1:] != (4,):

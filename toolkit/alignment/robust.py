@@ -51,8 +51,7 @@ def nearest_rotation(matrices: Floats, keep: Floats | None = None) -> Floats:
 def rigid_poses(poses: ArrayLike, name: str) -> tuple[Floats, Bools]:
     """Return poses (M, 4, 4) with exact rotations, and which of them are finite; the other ones become identities.
 
-    Raises:
-        AlignmentError: a wrong shape, or a finite matrix that is not a rigid pose; gives `name` and the index.
+    Raise AlignmentError for a wrong shape, or a finite matrix that is not a rigid pose; gives `name` and the index.
     """
     matrices = np.array(poses, np.float64)
     if matrices.size == 0 and matrices.shape[:1] == (0,):
@@ -79,8 +78,7 @@ def rigid_poses(poses: ArrayLike, name: str) -> tuple[Floats, Bools]:
 def checked_weights(weights: ArrayLike | None, count: int) -> Floats:
     """Return weights (count,), all 1 for None.
 
-    Raises:
-        AlignmentError: a wrong shape, or a weight that is negative or not finite.
+    Raise AlignmentError for a wrong shape, or a weight that is negative or not finite.
     """
     if weights is None:
         return np.ones(count)
@@ -121,16 +119,14 @@ def robust_mean_pose(world_from_cams: ArrayLike, covariances: ArrayLike) -> Pose
     """Return the robust mean of pose hypotheses on SE(3), and its covariance.
 
     The hypotheses are taken as independent. The start is the hypothesis closest to all of them. Iteratively reweighted
-    least squares in its tangent space refine it, with Huber weights within the gate and 0 beyond.
+    least squares in its tangent space refine it, with Huber weights within the gate and 0 beyond. Raise AlignmentError
+    if there is no hypothesis, a shape is wrong, a matrix is not a rigid pose, or a covariance is not positive definite;
+    gives the index.
 
     Args:
         world_from_cams: (H, 4, 4); hypotheses that are not finite are left out.
         covariances: (H, 6, 6), see `PoseMean.covariance`. A common factor of at least 1 widens them to explain the
             spread.
-
-    Raises:
-        AlignmentError: there is no hypothesis, a shape is wrong, a matrix is not a rigid pose, or a covariance is not
-            positive definite; gives the index.
     """
     poses, finite = rigid_poses(world_from_cams, "world_from_cams")
     usable = np.flatnonzero(finite)

@@ -14,8 +14,7 @@ _LARGEST = 2**31 - 1  # largest image side, pixels; COLMAP cannot hold larger nu
 def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
     """Return the camera of a line of sensors.txt: its type, `camera` or `depth`, and the text after it.
 
-    Raises:
-        ValueError: the sensor is not a camera, or its model, size or parameters are not valid.
+    Raise ValueError if the sensor is not a camera, or its model, size or parameters are not valid.
     """
     if sensor_type not in CAMERA_TYPES:
         raise ValueError(f"found type {sensor_type!r}, expected one with intrinsics: {' or '.join(CAMERA_TYPES)}.")

@@ -57,8 +57,7 @@ _FILM_DIAGONAL_MM = float(np.hypot(36, 24))
 def read_file(path: str | Path) -> bytes:
     """Return the content of an image file.
 
-    Raises:
-        ImageError: the file is missing, cannot be read, is too large, or is a folder, a pipe or a device.
+    Raise ImageError if the file is missing, cannot be read, is too large, or is a folder, a pipe or a device.
     """
     with _open(path) as stream:
         return stream.read()
@@ -134,15 +133,13 @@ def read_image(
 ) -> NDArray[np.uint8]:
     """Return an image as stored, (H, W, 3) RGB uint8, or (H, W) if `gray`.
 
-    EXIF orientation is ignored, because a capture's intrinsics refer to the stored pixels.
+    EXIF orientation is ignored, because a capture's intrinsics refer to the stored pixels. Raise ImageError if the file
+    is missing or cannot be decoded; see `decode`.
 
     Args:
         least_side: decode a color JPEG at 1/8, 1/4 or 1/2 of its size if both sides stay whole numbers and the shorter
             one has at least this many pixels. Saves time for callers that reduce the image anyway. None: full size.
         longest: reduce the image to a longer side of at most this many pixels, without aliasing. None: do not.
-
-    Raises:
-        ImageError: the file is missing or cannot be decoded; see `decode`.
     """
     flags = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR
     sizes = (None, None) if gray else (least_side, longest)
@@ -156,11 +153,10 @@ def pixels_of(
 ) -> NDArray[np.uint8]:
     """Return an image in gray, (H, W), or in color, (H, W, 3) RGB.
 
+    Raise ImageError if the file is missing or cannot be decoded, or the pixels have another shape or type.
+
     Args:
         image: a file, see `read_image`; or pixels (H, W) or (H, W, 3) RGB uint8.
-
-    Raises:
-        ImageError: the file is missing or cannot be decoded, or the pixels have another shape or type.
     """
     if isinstance(image, str | Path):
         return read_image(image, gray, least_side)
@@ -273,8 +269,7 @@ def find_mask(image: Path, masks: Path | None = None) -> Path | None:
 def read_header(path: Path) -> tuple[tuple[int, int], dict[int, Any]]:
     """Return the stored width and height of an image, and its EXIF tags by number.
 
-    Raises:
-        ImageError: the file is missing, not an image, or has more than `images.MOST_PIXELS` pixels.
+    Raise ImageError if the file is missing, not an image, or has more than `images.MOST_PIXELS` pixels.
     """
     if not is_file(path):
         raise ImageError(NO_FILE)
@@ -322,13 +317,11 @@ def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
 
     FocalLengthIn35mmFilm refers to the diagonal of 36 mm x 24 mm film (CIPA DC-008). Without that tag, the focal length
     is FocalLength times FocalPlaneXResolution, scaled if the image was resized later. An image whose sides have another
-    ratio than in EXIF was cropped; the tags are those of the whole image.
+    ratio than in EXIF was cropped; the tags are those of the whole image. Raise ImageError if the image cannot be read,
+    or has no focal length in EXIF.
 
     Returns:
         A SIMPLE_PINHOLE camera, and a phrase that names the tags used.
-
-    Raises:
-        ImageError: the image cannot be read, or has no focal length in EXIF.
     """
     (width, height), exif = read_header(path)
     focal_mm, film_mm = read_number(exif, _FOCAL_MM), read_number(exif, _FOCAL_35MM)

@@ -118,14 +118,13 @@ class TextTable:
 def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = False) -> TextTable:
     """Read a comma-separated text file of the capture format.
 
+    Raise CaptureError if the file cannot be read, or (strict) is missing or has a malformed line. The message gives the
+    line number, the text found and what was expected.
+
     Args:
         columns: name and type of each column, as in COLUMNS.
         strict: raise at a malformed line; else drop it and list it in `.problems`.
         extra: keep the text after the last column, as column `extra`.
-
-    Raises:
-        CaptureError: the file cannot be read, or (strict) is missing or has a malformed line. The message gives the
-            line number, the text found and what was expected.
     """
     try:
         if path.exists() and not path.is_file():  # opening a pipe blocks forever, reading a device never ends
@@ -327,8 +326,7 @@ def in_unit_of_poses(table: pd.DataFrame, unit: str | None) -> pd.DataFrame:
 def read_query_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
     """Read the CSV file of a pair with one row per query: timestamp as int64, device_id and `columns` as text.
 
-    Raises:
-        ArtifactError: the file cannot be read, is not such a table, or lacks a column.
+    Raise ArtifactError if the file cannot be read, is not such a table, or lacks a column.
     """
     types: dict[Any, Any] = {"timestamp": np.int64, "device_id": str, **dict.fromkeys(columns, str)}
     try:

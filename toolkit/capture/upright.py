@@ -62,10 +62,8 @@ def estimate_world_up(sessions: Sequence[Session]) -> WorldUp:
 
     Upright cameras distinguish up from down. If the cameras do not, up is +z if z is within 25 degrees of the axis (the
     convention of CroCoDL and LaMAR), else the sign is arbitrary; `known` is False in both cases. Cameras that all look
-    along -z are taken for those of a drone; whether z is up, they cannot tell.
-
-    Raises:
-        CaptureError: no image has a pose.
+    along -z are taken for those of a drone; whether z is up, they cannot tell. Raise CaptureError if no image has a
+    pose.
     """
     axes, centers, groups = _posed_cameras(sessions)
     count = len(axes)

@@ -36,7 +36,8 @@ def write_session(
 ) -> Path:
     """Write the text files of a session, not its images. Return the folder.
 
-    Arguments that are None are not written.
+    Arguments that are None are not written. Raise ValueError if the format cannot store a value: it contains a comma or
+    a line break, begins or ends with a space, or starts a line with #.
 
     Args:
         path: the session's folder; created if missing.
@@ -48,10 +49,6 @@ def write_session(
         ground_truth: written to proc/alignment_trajectories.txt.
         wifi: rows (timestamp, sensor_id, MAC address, kHz, dBm, name, start and end of the scan, microseconds).
         bt: rows (timestamp, sensor_id, id, dBm, name), the id as `<guid>:<major>:<minor>`.
-
-    Raises:
-        ValueError: the format cannot store a value: it contains a comma or a line break, begins or ends with a space,
-            or starts a line with #.
     """
     path = Path(path)
     write_table(path / "sensors.txt", "sensor_id, name, sensor_type, [sensor_params]+", map(_line, sensors))
@@ -95,10 +92,8 @@ def _line(values: Sequence[Any]) -> str:
 def read_depth(path: str | Path) -> NDArray[np.float32]:
     """Return a depth map, (H, W) float32 meters along the camera's z axis, 0 where unknown.
 
-    The largest number, 65535, means unknown, too, as in 7-Scenes.
-
-    Raises:
-        CaptureError: the file cannot be read or is not a 16-bit image.
+    The largest number, 65535, means unknown, too, as in 7-Scenes. Raise CaptureError if the file cannot be read or is
+    not a 16-bit image.
     """
     import cv2
 

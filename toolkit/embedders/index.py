@@ -75,11 +75,8 @@ def make_index(
 ) -> VectorIndex | None:
     """Build the index of a map, or read the current one; None if none is needed, see `load_index`.
 
-    It is a file in the folder `index` beside that of the embeddings. Needs memory for it and for 1 GB of vectors.
-
-    Raises:
-        ManifestError: FAISS has no such index, or cannot build it from N vectors.
-        ValueError: a value is not finite.
+    It is a file in the folder `index` beside that of the embeddings. Needs memory for it and for 1 GB of vectors. Raise
+    ManifestError if FAISS has no such index, or cannot build it from N vectors; ValueError if a value is not finite.
     """
     for path, record, part in _files(embeddings, map_id, vectors, settings):
         if not (skip_existing and is_current(path, record)):
@@ -95,10 +92,8 @@ def is_index_current(embeddings: Path, map_id: str, vectors: Vectors, settings: 
 
 def load_index(embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveSettings) -> VectorIndex | None:
     """Read the index that the retrieve stage built for a map; None for an exact search: if the settings say so, or if
-    the map has no more vectors than the index has candidates, cells or PCA dimensions.
-
-    Raises:
-        ArtifactError: the file is missing or damaged, or was made from other vectors.
+    the map has no more vectors than the index has candidates, cells or PCA dimensions. Raise ArtifactError if the
+    file is missing or damaged, or was made from other vectors.
     """
     indexes = [_open(*file, settings) for file in _files(embeddings, map_id, vectors, settings)]
     return (

@@ -140,12 +140,11 @@ def require_finite(matrix: NDArray[np.float32], name: str, first: int | Ints = 0
 def open_embeddings(folder: str | Path) -> tuple[Vectors, pd.DataFrame]:
     """Open the embeddings in `<embeddings>/<session>`, or in a subsession's folder there; vectors stay on disk.
 
+    Raise ArtifactError if there are none, a file is damaged, or files do not fit together.
+
     Returns:
         The vectors (N, D), and a table of their images: row_index, device_id, sensor_id, timestamp, abs_path,
         subsession.
-
-    Raises:
-        ArtifactError: there are none, a file is damaged, or files do not fit together.
     """
     folder = Path(folder)
     manifests = sorted(folder.rglob("manifest.csv"))

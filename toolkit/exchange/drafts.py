@@ -205,11 +205,9 @@ class Draft(Options):
     def finish(self, held: Collection[str] | None = None) -> ImportReport:
         """Write the session without the images that cannot be used, and the queries that are held out of it.
 
-        These are the frames `held`, or images without rigs; None: every `hold_out`-th.
-
-        Raises:
-            CaptureError: a session has no image left, or exists; none is written.
-            ManifestError: `hold_out` is not 0 or between 2 and the number of frames.
+        These are the frames `held`, or images without rigs; None: every `hold_out`-th. Raise CaptureError if a session
+        has no image left, or exists; none is written; ManifestError if `hold_out` is not 0 or between 2 and the number
+        of frames.
         """
         self._take_times()
         self._place_world()

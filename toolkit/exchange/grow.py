@@ -79,8 +79,7 @@ def add_recording(
 def remove_recording(name: str, capture: str | Path, device: str = "ios") -> str:
     """Remove the images whose names start with a recording's name from the map session; return what was done, in words.
 
-    Raises:
-        CaptureError: the session was not reconstructed, no image has such a name, or all have.
+    Raise CaptureError if the session was not reconstructed, no image has such a name, or all have.
     """
     folder, session = Path(capture) / FOLDER, Path(capture) / "sessions" / f"{device}_map"
     model, opened = _model(folder, session), Session.open(session)

@@ -32,18 +32,15 @@ def import_panoramas(
 
     The frame of a panorama is that of COLMAP's EQUIRECTANGULAR: z points to the center of the picture, x to the right,
     y down. It is the frame of the rig, so the pose of a query is that of its panorama. The ground and the sky more than
-    45 degrees from the horizon are left out. A mask of a panorama is cut as well, see `images.find_mask`.
+    45 degrees from the horizon are left out. A mask of a panorama is cut as well, see `images.find_mask`. Raise
+    CaptureError for a malformed table, a map without poses, two panoramas of one name, the session exists already, or
+    no panorama is left; ManifestError as for `interchange.import_images`.
 
     Args:
         images: folder of JPEG and PNG files.
         capture, device, split: as for `interchange.import_colmap`.
         table, poses_are: as for `interchange.import_images`, with a row for each panorama.
         options: see `drafts.Options`; `unit_m` is 1 by default.
-
-    Raises:
-        CaptureError: a malformed table, a map without poses, two panoramas of one name, the session exists already, or
-            no panorama is left.
-        ManifestError: as for `interchange.import_images`.
     """
     folder = Path(images)
     options["placing"], masks = "copy", options.pop("masks", None)  # masks are cut here

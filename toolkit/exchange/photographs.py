@@ -58,10 +58,8 @@ def gather(
     Names are paths in the source. If there are several sources, or with `prefixed`, the source's name comes first.
 
     Frames of videos, and photographs in other formats than JPEG and PNG, are written to the folder `made`, once. For
-    `masks` see `images.find_mask`.
-
-    Raises:
-        CaptureError: a source is missing or is no image or video, or two photographs would have one name.
+    `masks` see `images.find_mask`. Raise CaptureError if a source is missing or is no image or video, or two
+    photographs would have one name.
     """
     photographs, unreadable = list[Photograph](), dict[str, str]()
     for name, source in _files(sources, made, fps, prefixed or len(sources) > 1):
@@ -141,10 +139,8 @@ def choose_frames(video: Path, fps: float | None = None) -> Iterator[tuple[int, 
     """Yield number and pixels (H, W, 3) BGR of the sharpest frame of each stretch of a video.
 
     A stretch ends when the image has moved by `STEP` since the last chosen frame, or after 1 / `fps` seconds. Of its
-    second half, the frame with the largest variance of the Laplacian is taken, so that neighbors differ.
-
-    Raises:
-        CaptureError: OpenCV cannot read the video.
+    second half, the frame with the largest variance of the Laplacian is taken, so that neighbors differ. Raise
+    CaptureError if OpenCV cannot read the video.
     """
     reader = cv2.VideoCapture(str(video))
     total, rate = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)), reader.get(cv2.CAP_PROP_FPS) or 30.0

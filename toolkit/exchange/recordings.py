@@ -69,10 +69,8 @@ def lines_of(path: Path) -> Iterator[tuple[str, list[str]]]:
 def read_csv(path: Path) -> pd.DataFrame:
     """Read a CSV table with a header, all values as text, with the additional column `line`.
 
-    Empty values beyond its columns, which spreadsheets write, are ignored.
-
-    Raises:
-        CaptureError: the file cannot be read, or a line has other columns than the header.
+    Empty values beyond its columns, which spreadsheets write, are ignored. Raise CaptureError if the file cannot be
+    read, or a line has other columns than the header.
     """
     reader = csv.reader(io.StringIO(read_text(path)), skipinitialspace=True, strict=True)
     rows: list[list[str | int]] = []
@@ -109,13 +107,11 @@ def numbers_of(where: str, words: Sequence[str], count: int) -> Floats:
 def to_us(times: Iterable[str | float], unit: str | None, where: object, near_us: Iterable[int] = ()) -> Ints:
     """Return times (N,) in microseconds.
 
+    Raise CaptureError if a time is no number; ManifestError if the unit is unknown.
+
     Args:
         unit: of `UNITS_US`; None: told by their size if they are times since 1970.
         near_us: times of images; the unit is that in which most of them are among the given times, if any is.
-
-    Raises:
-        CaptureError: a time is no number.
-        ManifestError: an unknown unit, or it is not known.
     """
     if unit is not None and unit not in UNITS_US:
         raise ManifestError(f"timestamps-unit: found {unit!r}, expected one of {', '.join(UNITS_US)}.")
@@ -136,14 +132,12 @@ def to_us(times: Iterable[str | float], unit: str | None, where: object, near_us
 def read_times(source: str | Path, names: Sequence[str], unit: str | None) -> dict[str, int]:
     """Return the time of images, microseconds, by name; those without one are missing.
 
+    Raise CaptureError if the file cannot be read, or has times of none of the images; ManifestError as for `to_us`.
+
     Args:
         source: a file with time and name in each line, in either order; or only times, see `lines_of_images` (KITTI);
             or `NAMES`.
         unit: see `to_us`.
-
-    Raises:
-        CaptureError: the file cannot be read, or has times of none of the images.
-        ManifestError: see `to_us`.
     """
     found = dict[str, str]()
     if str(source) == NAMES:
@@ -181,15 +175,12 @@ def read_track(path: Path, unit: str | None, times: Path | None = None, near_us:
 
     A line has 8 numbers: time, position, qx qy qz qw (TUM), or of nanoseconds and commas: qw qx qy qz, which may be
     followed by a state (EuRoC); 12: a 3 x 4 matrix (KITTI); 13 or 17: a time, then a 3 x 4 or 4 x 4 matrix, whose
-    columns may follow each other (ARKit).
+    columns may follow each other (ARKit). Raise CaptureError if the file cannot be read, or most lines are no poses;
+    ManifestError as for `to_us`.
 
     Args:
         unit, near_us: see `to_us`.
         times: file with a time per line, for lists that have none.
-
-    Raises:
-        CaptureError: the file cannot be read, or most lines are no poses.
-        ManifestError: see `to_us`.
     """
     lines, head = lines_of(path), read_text(path, "replace").partition("\n")[0]
     rows = list(islice(lines, 2))
@@ -238,13 +229,11 @@ def read_track(path: Path, unit: str | None, times: Path | None = None, near_us:
 def read_fixes(path: Path) -> pd.DataFrame:
     """Read GPS fixes: a CSV file with the columns image or timestamp, latitude, longitude, altitude, and accuracy.
 
-    Altitude and accuracy, in meters, may be missing.
+    Altitude and accuracy, in meters, may be missing. Raise CaptureError if the file cannot be read, or a column is
+    missing or has another value than a number.
 
     Returns:
         A table with all columns, image and timestamp as text; empty where there is none.
-
-    Raises:
-        CaptureError: the file cannot be read, or a column is missing or has another value than a number.
     """
     rows = read_csv(path)
     defaults = {"image": "", "timestamp": "", "altitude": "0", "accuracy": str(NO_ACCURACY_M)}

@@ -45,6 +45,9 @@ def import_transforms(
 ) -> ImportReport:  # fmt: skip
     """Make a session, or a map and a query session, from a transforms.json. Images keep their `file_path` as names.
 
+    Raise CaptureError for a malformed file (names frame and key), or a session that exists already or has no usable
+    image; ManifestError as for `drafts.start`.
+
     Args:
         capture, device, split: as for `interchange.import_colmap`.
         undo_applied: return to the world before `applied_transform` and `applied_scale`, as of the COLMAP model that
@@ -52,10 +55,6 @@ def import_transforms(
         own_split: without `hold_out`, the images of a map that the file names in `test_filenames` and `val_filenames`
             become queries.
         options: see `drafts.Options`; `axes` are `opengl` by default.
-
-    Raises:
-        CaptureError: a malformed file (names frame and key), or a session that exists already or has no usable image.
-        ManifestError: as for `drafts.start`.
     """
     path = Path(path)
     options.setdefault("axes", "opengl")
@@ -197,9 +196,8 @@ class _Frame:
     def camera(self) -> pycolmap.Camera:
         """Return the intrinsics.
 
-        Raises:
-            ImageError: the file does not state the image size, and the image header cannot be read.
-            CaptureError: the intrinsics are missing or malformed.
+        Raise ImageError if the file does not state the image size, and the image header cannot be read; CaptureError if
+        the intrinsics are missing or malformed.
         """
         pixels = "pixels, a number"
         size = [self._number(key, pixels) for key in "wh" if key in self.values]

@@ -147,8 +147,7 @@ def extract_turned(
 def usable(features: LocalFeatures, mask: Path | None, camera: pycolmap.Camera) -> LocalFeatures:
     """Return the features outside of the black pixels of an image's mask, as COLMAP does, that have a viewing ray.
 
-    Raises:
-        ImageError: the mask cannot be read, has another size than the image as stored, or is black everywhere.
+    Raise ImageError if the mask cannot be read, has another size than the image as stored, or is black everywhere.
     """
     if not sees_all(camera):
         features = features.take(np.flatnonzero(invertible(camera, features.keypoints)))

@@ -84,10 +84,8 @@ class LightGlueMatcher(Remade):
         """Return the matches of pairs of images, in the order of the first image's features.
 
         If several pairs share an image (the same object), it goes through the first half of the first layer only once.
-
-        Raises:
-            ToolkitError: features of another kind; a confidence is not finite; or not even one pair fits the
-                device's memory.
+        Raise ToolkitError if features are of another kind, a confidence is not finite, or not even one pair fits the
+        device's memory.
         """
         matches = [PairMatches.none() for _ in pairs]
         # Pairs with similar numbers of features form a batch, as all are padded to the largest. The largest come first,

@@ -90,9 +90,8 @@ class NetworkExtractor(Remade):
     def extract(self, images: Sequence[NDArray[np.uint8]]) -> list[LocalFeatures]:
         """Return the features of images, (H, W) gray or (H, W, 3) RGB, uint8, of any sizes; float16 descriptors.
 
-        Raises:
-            ValueError: an image has another shape or type.
-            ToolkitError: a response is not finite, or not even one image fits the device's memory.
+        Raise ValueError if an image has another shape or type; ToolkitError if a response is not finite, or not even
+        one image fits the device's memory.
         """
         prepared = [self._prepare(image) for image in images]
         by_shape: dict[tuple[int, ...], list[int]] = {}

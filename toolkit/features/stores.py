@@ -61,9 +61,8 @@ class FeatureStore(Mapping[str, LocalFeatures]):
     def open(cls, path: str | Path) -> "FeatureStore":
         """Open a folder of features, without a check whether its images have changed.
 
-        Raises:
-            ArtifactError: the folder is missing, or has no features. Damaged features raise `DamagedError` later, when
-                they are read.
+        Raise ArtifactError if the folder is missing, or has no features. Damaged features raise `DamagedError` later,
+        when they are read.
         """
         items = Items(path)
         if not items:

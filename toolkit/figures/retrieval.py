@@ -119,10 +119,8 @@ class RetrievedPair:
         A map image overlaps with the query if at least `MIN_OVERLAP` of the map points that it observes lie in the
         query's view at the true pose (`metrics.overlap_in_view`). Without a triangulated map, points at 2, 4, 8 and 16
         m in the map image's view replace the map points; these ignore walls. Without a true pose, overlap is NaN.
-        Similarities are computed from the stored descriptors.
-
-        Raises:
-            ArtifactError: no query matches, or several do (the nearest is named), or its descriptors are missing.
+        Similarities are computed from the stored descriptors. Raise ArtifactError if no query matches, or several do
+        (the nearest is named), or its descriptors are missing.
         """
         number = find_query(query, {name: number for number, name in enumerate(self.names)}, len(self.names))
         line = self.lines[number]

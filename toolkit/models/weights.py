@@ -219,12 +219,11 @@ ALIKED_LIGHTGLUE = ReleasedWeights(
 def find_weights(source: WeightsSource, checkpoint: str | Path | None = None) -> Path | None:
     """Return the file with the weights if it is on this machine, else None. Does not use the network.
 
+    Raise WeightsError if `checkpoint` does not exist. The caches are then not searched.
+
     Args:
         checkpoint: the file, or the folder that holds it under its official name; `~` and `$VARIABLES` are expanded.
             None: search installed packages and caches.
-
-    Raises:
-        WeightsError: `checkpoint` does not exist. The caches are then not searched.
     """
     if checkpoint is None:
         cached = (release.cached() for release in (source, *source.others))
@@ -243,11 +242,9 @@ def resolve_weights(source: WeightsSource, checkpoint: str | Path | None = None)
     """Return the file with the weights; download it into a cache if it is not on this machine.
 
     A download shows its progress. Its SHA-256 must be that of the release, or the one that the hub states. The
-    environment variables of huggingface_hub apply: HF_HOME, HF_ENDPOINT, HF_HUB_OFFLINE, HF_TOKEN and others.
-
-    Raises:
-        WeightsError: `checkpoint` does not exist, or the download failed; says why, and where to put the file. A
-            partial download is never used later.
+    environment variables of huggingface_hub apply: HF_HOME, HF_ENDPOINT, HF_HUB_OFFLINE, HF_TOKEN and others. Raise
+    WeightsError if `checkpoint` does not exist, or the download failed; says why, and where to put the file. A partial
+    download is never used later.
     """
     if found := find_weights(source, checkpoint):
         return found
@@ -281,12 +278,10 @@ def check_weights(source: WeightsSource, path: Path) -> None:
 def read_state_dict(checkpoint: "str | Path | Mapping[str, Tensor]") -> "dict[str, Tensor]":
     """Return the tensors of a checkpoint, a file or a dict, by name, on the CPU.
 
-    Reads safetensors, and files of `torch.save` that hold tensors only; never runs code in a file. The tensors may
-    be in a nested dict, under `model`, `state_dict` or the like. Removes a prefix `module.` or `model.` that all names
-    share. Tensors may be memory-mapped: do not change the file while they are in use.
-
-    Raises:
-        WeightsError: the file is missing, damaged, or no checkpoint; would run code; or holds more than tensors.
+    Reads safetensors, and files of `torch.save` that hold tensors only; never runs code in a file. The tensors may be
+    in a nested dict, under `model`, `state_dict` or the like. Removes a prefix `module.` or `model.` that all names
+    share. Tensors may be memory-mapped: do not change the file while they are in use. Raise WeightsError if the file is
+    missing, damaged, or no checkpoint; would run code; or holds more than tensors.
     """
     import torch
     from safetensors.torch import load_file
@@ -330,7 +325,8 @@ def load_checkpoint(
 
     The module takes the tensors over without a copy if data type and layout allow. A module built under
     `torch.device("meta")` then needs no more memory than its weights, and shares them with a dict passed as
-    `checkpoint`. Other floating types are converted to the module's.
+    `checkpoint`. Other floating types are converted to the module's. Raise WeightsError if it is no checkpoint, or one
+    of another network; lists the missing, unexpected, and mis-shaped or mis-typed keys. The module is then unchanged.
 
     Args:
         module: has the checkpoint's parameters and buffers, with the same shapes and types.
@@ -338,10 +334,6 @@ def load_checkpoint(
         name: name of the network, for messages; empty: the module's class.
         ignore: prefixes of keys that the module does not need.
         rename: maps the other tensors to the module's names.
-
-    Raises:
-        WeightsError: no checkpoint, or one of another network; lists the missing, unexpected, and mis-shaped or
-            mis-typed keys. The module is then unchanged.
     """
     state = read_state_dict(checkpoint)
     state = rename({key: value for key, value in state.items() if not key.startswith(ignore)})

@@ -99,15 +99,13 @@ class NetworkPredictor:
     ) -> None:
         """Find the weights: the file `checkpoint`, else the hub's, which is downloaded if need be.
 
+        Raise ManifestError if the precision does not exist or is float16; WeightsError if the weights are missing.
+
         Args:
             compute_device, dtype_compute: see `models.compute`. float16 is refused, as activations of the trunk may
                 overflow it; `auto` takes float32 where it would choose float16. The heads always run in float32.
             batch_size: largest number of groups per batch; None takes a default for the device.
             cache_bytes: memory of the CPU for encodings of map images.
-
-        Raises:
-            ManifestError: the precision does not exist or is float16.
-            WeightsError: the weights are missing.
         """
         expected = [name for name in PRECISIONS if name != "float16"]
         if dtype_compute not in expected:
@@ -149,11 +147,8 @@ class NetworkPredictor:
         cannot be decoded, or does not have the size of its camera, have NaN in `model_from_cams` and `depth`, and 0 in
         `depth_conf`; the log says why. If this is the query, the whole prediction is NaN, without depth, and gives the
         reason. Groups do not influence each other: those with equal numbers of views and equal image size run in one
-        batch, which is halved if it does not fit the memory.
-
-        Raises:
-            WeightsError: at the first call, the file does not belong to this network.
-            ToolkitError: the device does not exist, or its memory does not hold a group.
+        batch, which is halved if it does not fit the memory. Raise WeightsError at the first call if the file does not
+        belong to this network; ToolkitError if the device does not exist, or its memory does not hold a group.
         """
         placed = [self._place(group) if group else [] for group in groups]
         results = [_nothing(len(group)) for group in groups]

@@ -104,10 +104,8 @@ def write_report(run_dir: str | Path) -> Path:
     can be mailed alone. Links to tables, poses, notebooks and recordings are relative to the run folder. The report
     leaves out missing files and names unreadable ones. It shows the pictures in the folder `visualization` by name:
     `worst*` with the worst queries, `localization*` as samples, `<pair>_sequence*` with the sequences, all remaining
-    ones as maps. A picture's title is the PNG's `Title` or `Description`.
-
-    Raises:
-        ArtifactError: `run.json` is missing or torn.
+    ones as maps. A picture's title is the PNG's `Title` or `Description`. Raise ArtifactError if `run.json` is missing
+    or torn.
     """
     from jinja2 import StrictUndefined, Template
 

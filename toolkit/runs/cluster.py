@@ -67,10 +67,8 @@ class Cluster:
             unit: str) -> None:  # fmt: skip
         """Call a function once per share on the workers, and return when all shares, each of `sizes` units, are done.
 
-        If a worker dies, the function is called again for its share.
-
-        Raises:
-            ToolkitError: a share killed several workers, or no worker is left. Errors of the function are raised too.
+        If a worker dies, the function is called again for its share. Raise ToolkitError if a share killed several
+        workers, or no worker is left. Errors of the function are raised too.
         """
         from distributed import CancelledError, KilledWorker, wait
 
@@ -161,6 +159,8 @@ def _version() -> str:
 def open_cluster(spec: str | None, say: Callable[[str], object] = print) -> Iterator[None]:
     """Let the stages that run in this context, here and in kernels, use a cluster.
 
+    Raise ManifestError if Dask is not installed, or `spec` is unknown or faulty; ToolkitError if no worker started.
+
     Args:
         spec: `local` or `local:<workers>` starts workers on this machine; without a number one per GPU, or one per core
             if there is no GPU. `tcp://<host>:<port>` uses the workers of a running scheduler. `slurm:<file>` (also pbs,
@@ -168,10 +168,6 @@ def open_cluster(spec: str | None, say: Callable[[str], object] = print) -> Iter
             arguments for the queue's class in dask-jobqueue, e.g. `queue`, `cores`, `memory`, `walltime`. None: no
             cluster.
         say: prints a line; called once with the number of workers and the address of the dashboard.
-
-    Raises:
-        ManifestError: Dask is not installed, or `spec` is unknown or faulty.
-        ToolkitError: no worker started.
     """
     if spec is None:
         yield

@@ -74,10 +74,8 @@ class InspectedPair:
 
     def look(self, query: int | str = 0) -> Answer:
         """Return a query with the stored results of the localize stage, by its number, the name of one of its images
-        (or a unique end of the name), or `worst`.
-
-        Raises:
-            ArtifactError: no query matches, or several do (the nearest is named), or its stored results are damaged.
+        (or a unique end of the name), or `worst`. Raise ArtifactError if no query matches, or several do (the nearest
+        is named), or its stored results are damaged.
         """
         if query == WORST and len(self):
             query = int(worst_first(self.localized.localizations.errors)[0])

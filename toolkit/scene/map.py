@@ -814,8 +814,7 @@ def needs_upright(settings: LocalizeSettings, kinds: Sequence[AnyMethod]) -> boo
 def create_methods(settings: LocalizeSettings) -> tuple[list[LocalMethod], list[DeferredMethod]]:
     """Return the kinds of features that every query needs, and those for queries without a sure pose.
 
-    Raises:
-        WeightsError: a network has no weights.
+    Raise WeightsError if a network has no weights.
     """
     if settings.method == "nearest":
         return [], []

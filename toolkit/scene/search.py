@@ -75,9 +75,7 @@ class ReferenceSearch:
         them.
 
         By default, there are `k` as in the run; `allowed` has, for each image, a mask over the rows `rows`, or None.
-
-        Raises:
-            ArtifactError: the map was embedded by another embedder.
+        Raise ArtifactError if the map was embedded by another embedder.
         """
         stored, rows = self._stored
         dims = stored.dims
