@@ -8,7 +8,8 @@ LAB_ARGS ?=
 INSTALLED := $(VENV)/.installed
 BIN := $(VENV)/bin
 # A worker needs up to 2 GB (slow tests: 6). Tests of a module stay in one worker because they share slow fixtures.
-PYTEST := $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadscope
+# Byte code is kept also where the environment forbids it, as in containers: each worker and kernel would compile all anew.
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadscope
 
 OF_KIND := $(PYTEST) -m "not browser and not gpu"
 NUMBERS := $(addprefix tests/,alignment embedders features mapping models pose prediction scene sequences synthetic \
