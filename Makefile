@@ -8,7 +8,8 @@ LAB_ARGS ?=
 INSTALLED := $(VENV)/.installed
 BIN := $(VENV)/bin
 # A worker needs up to 2 GB (slow tests: 6). Tests of a module stay in one worker because they share slow fixtures.
-PYTEST := $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadscope
+# Byte code is kept also where the environment forbids it, as in containers: each worker and kernel would compile all anew.
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadscope
 
 OF_KIND := $(PYTEST) -m "not browser and not gpu"
 NUMBERS := $(addprefix tests/,alignment embedders features mapping models pose prediction scene sequences synthetic \
@@ -35,11 +36,14 @@ run: $(INSTALLED)  ## run RUN_MANIFEST=data_manifests/<yours>.yaml
 test: $(INSTALLED)  ## run the default tests, about 3 minutes on 2 idle cores
 	$(PYTEST)
 
-# An AVX2 laptop has the kernels of Haswell, a processor without AVX those of Prescott.
+# An AVX2 laptop has the kernels of Haswell, a processor without AVX those of Prescott. Left out is what does not ask
+# NumPy's BLAS: networks, which have torch's own, and tests of files and pictures.
 test-kernels: $(INSTALLED)  ## run the tests of numbers with other BLAS kernels and numbers of threads
 	@set -e; for run in "Haswell 1" "Prescott 2"; do echo "$$run BLAS threads"; \
-	OPENBLAS_CORETYPE=$${run% *} OPENBLAS_NUM_THREADS=$${run#* } $(PYTEST) tests/test_threads.py tests/test_localize.py \
-	tests/test_geometry.py tests/features tests/embedders tests/alignment tests/mapping tests/pose tests/prediction tests/scene tests/sequences; done
+	OPENBLAS_CORETYPE=$${run% *} OPENBLAS_NUM_THREADS=$${run#* } $(PYTEST) tests/test_localize.py tests/test_geometry.py \
+	$(addprefix tests/,features embedders alignment mapping pose prediction scene sequences) \
+	$(addsuffix .py,$(addprefix --ignore=tests/,features/test_aliked features/test_lightglue features/test_stores \
+	features/test_superpoint prediction/test_network_predictor scene/test_inspection scene/test_located)); done
 
 # All tests of a kind, default and slow. Together the three have every test that needs neither a browser nor a GPU.
 test-numbers: $(INSTALLED)  ## test what is computed: features, maps, poses, networks, errors, accuracy on captures

@@ -3,6 +3,7 @@
 What takes long to make is made once, also where pytest-xdist has several workers: the first makes it, the others wait.
 """
 
+import gc
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -20,6 +21,15 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     # The workers share the cores: one thread each, here (before torch is imported) and in what a test starts.
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(name, "1")
+
+
+gc.disable()  # while the tests are imported: what they import stays
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage from here on, without a look at what was imported."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(trylast=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -60,6 +61,12 @@ def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> SceneFi
     return files
 
 
+def exactly(array: Any) -> object:
+    """Return what an array holds, to compare."""
+    array = np.asarray(array)
+    return array.tolist() if array.dtype.hasobject else (array.dtype.str, array.shape, array.tobytes())
+
+
 def content(folder: Path) -> dict[str, Any]:
     """Return what a run holds but for times, by file; records and settings left out."""
     found: dict[str, Any] = {}
@@ -67,14 +74,14 @@ def content(folder: Path) -> dict[str, Any]:
         name = path.relative_to(folder).as_posix()
         if path.suffix == ".shard":
             found[Path(name).parent.as_posix()] = {
-                item: {key: array.tolist() for key, array in arrays.items()}
+                item: {key: exactly(array) for key, array in arrays.items()}
                 for item, arrays in sorted(Items(path.parent).items())
             }
         elif path.suffix == ".h5":
             items: dict[str, Any] = {}
             with h5py.File(path) as file:
                 file.visititems(lambda key, item, items=items: items.update(
-                    {key: item[()].tolist()} if isinstance(item, h5py.Dataset) else {}))  # fmt: skip
+                    {key: exactly(item[()])} if isinstance(item, h5py.Dataset) else {}))  # fmt: skip
             found[name] = items
         elif path.suffix == ".csv" and "poses" in name:
             found[name] = pd.read_csv(path).drop(columns="seconds").to_csv()

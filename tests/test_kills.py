@@ -16,6 +16,7 @@ import pandas as pd
 import pytest
 
 from tests.conftest import REPOSITORY
+from tests.test_damage import exactly
 from tests.viewer.test_sessions import read_back
 from toolkit.store.items import Items
 
@@ -82,7 +83,7 @@ def arrays_of(path: Path) -> dict[str, object]:
         def add(name: str, item: h5py.Dataset | h5py.Group) -> None:
             found[name] = repr(sorted(item.attrs.items()))
             if isinstance(item, h5py.Dataset):
-                found[name] = (found[name], item.shape, item.dtype.str, item[()].tolist())
+                found[name] = (found[name], exactly(item[()]))
 
         file.visititems(add)
     return found
@@ -98,7 +99,7 @@ def products(run: Path) -> dict[str, object]:
         if name in ("run.json", "run.log") or "/.stages/" in name:
             continue
         if path.suffix == ".shard":  # kills change which item is in which
-            items = {item: {key: array.tolist() for key, array in arrays.items()}
+            items = {item: {key: exactly(array) for key, array in arrays.items()}
                      for item, arrays in Items(path.parent).items()}  # fmt: skip
             found[path.parent.relative_to(run).as_posix()] = items
         elif path.suffix == ".rrd":

@@ -3,6 +3,7 @@
 import ast
 import shutil
 import subprocess
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -47,6 +48,7 @@ def module_name(path: Path) -> str:
 MODULES = {module_name(path): path for path in sorted(TOOLKIT.rglob("*.py"))}
 
 
+@cache
 def imports_of(path: Path) -> set[str]:
     """Return the modules of the toolkit that a file imports anywhere, at the top or inside a function."""
     imported: set[str] = set()

@@ -42,11 +42,16 @@ QUICK = ("OPENCV", "RAD_TAN_THIN_PRISM_FISHEYE")
 HOLD_OUT = 3
 
 
-def warped(pixels: NDArray[np.uint8], pinhole: pycolmap.Camera, camera: pycolmap.Camera) -> NDArray[np.uint8]:
-    """Return the image that another camera takes from the same place; black beyond the pinhole image."""
+def rays_of(camera: pycolmap.Camera) -> NDArray[np.float64]:
+    """Return the direction (H, W, 3) in which each pixel looks."""
     grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1).reshape(-1, 2) + 0.5
-    seen = np.asarray(pinhole.img_from_cam(np.asarray(camera.cam_ray_from_img(grid)))) - 0.5
-    x, y = seen.T.reshape(2, camera.height, camera.width).astype(np.float32)
+    return np.asarray(camera.cam_ray_from_img(grid)).reshape(camera.height, camera.width, 3)
+
+
+def warped(pixels: NDArray[np.uint8], pinhole: pycolmap.Camera, rays: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Return the image that a camera with these rays takes from the same place; black beyond the pinhole image."""
+    seen = np.asarray(pinhole.img_from_cam(rays.reshape(-1, 3))) - 0.5
+    x, y = seen.T.reshape(2, *rays.shape[:2]).astype(np.float32)
     return cv2.remap(pixels, x, y, cv2.INTER_AREA)  # type: ignore[return-value]
 
 
@@ -57,7 +62,7 @@ def write_model(folder: Path, small: Path, model: str) -> None:
     params = [float(word) for word in MODELS[model].split()]
     camera = pycolmap.Camera(model=model, width=640, height=480, params=params)
     (folder / "model" / "cameras.txt").write_text(f"1 {model} 640 480 {MODELS[model]}\n")
-    capture, lines = Capture.open(small), []
+    capture, lines, rays = Capture.open(small), [], rays_of(camera)
     for name in ("ios_map", "ios_query"):
         session = capture[name]
         poses = session.world_from_cam(ground_truth=name == "ios_query")
@@ -65,7 +70,7 @@ def write_model(folder: Path, small: Path, model: str) -> None:
             # Every third name is that of a query.
             file = f"{row // 2 * 3 + row % 2}.png" if name == "ios_map" else f"{3 * row + 2}.png"
             pixels = read_image(session.image_path(row))
-            image = warped(pixels, session.cameras([row])[0], camera)
+            image = warped(pixels, session.cameras([row])[0], rays)
             cv2.imwrite(str(folder / "images" / file), image[..., ::-1])
             words = " ".join(repr(float(value)) for value in qt_from_pose(invert(pose)))
             lines.append(f"{len(lines) + 1} {words} 1 {file}\n\n")

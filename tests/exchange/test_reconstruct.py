@@ -85,10 +85,10 @@ def test_every_photograph_has_a_row(place: Path) -> None:
 def test_a_run_takes_the_features(place: Path, tmp_path: Path) -> None:
     for name in ("ios_map", "ios_query"):
         session = Capture.open(place)[name]
-        made = next((session.path / "proc/features").glob("sift-*/*.shard"))
+        made = {shard.name for shard in (session.path / "proc/features").glob("sift-*/*.shard")}
         store = extract_session(session, tmp_path)
         path = features_path(tmp_path, name, SiftExtractor().settings)
-        assert [shard.name for shard in path.glob("*.shard")] == [made.name]
+        assert {shard.name for shard in path.glob("*.shard")} == made != set()
         assert set(session.image_names) <= set(store)
 
 

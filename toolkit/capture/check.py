@@ -133,7 +133,7 @@ class _SessionCheck:
     def _add_rows(self, file: str, mask: Any, message: str, severity: str = ERROR) -> None:
         """Report the rows of a file where the mask holds; `{column}` in the message is replaced by the row's value."""
         rows = self.rows[file][mask]
-        for line, row in zip(rows.index, rows.to_dict("records"), strict=True):
+        for line, row in zip(rows.index, rows.to_dict("records") if len(rows) else [], strict=True):
             self._add(file, line, message.format(**row), severity)
 
     @property
