@@ -139,7 +139,8 @@ def fit(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, Floats, float, 
         a, b = source[inliers], target[inliers]
         new_from_old = pycolmap.estimate_sim3d(a, b) or new_from_old
     errors = np.linalg.norm(new_from_old * a - b, axis=1)
-    spread = np.linalg.svd(b - b.mean(axis=0), compute_uv=False)
+    # Of the model: noise spreads the known positions, which would then state a scale surer than it is.
+    spread = new_from_old.scale * np.linalg.svd(a - a.mean(axis=0), compute_uv=False)
     sigma = np.sqrt((errors**2).sum() / max(3 * len(a) - 7, 1))
     level = bool(np.degrees(sigma / max(spread[1], 1e-9)) < MAX_TILT_DEG)
     if not level:  # rotate about z only
