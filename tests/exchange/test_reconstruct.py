@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from toolkit.__main__ import app
 from toolkit.capture import Capture
+from toolkit.capture.cameras import camera_text
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange import reconstruct as module
 from toolkit.exchange.photographs import choose_frames, gather, initial_cameras
@@ -20,7 +21,7 @@ from toolkit.exchange.reconstruct import reconstruct
 from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import extract_session, features_path
 from toolkit.files import read_json
-from toolkit.geometry import Floats
+from toolkit.geometry import Floats, qt_from_pose
 
 
 @pytest.fixture(scope="session")
@@ -105,6 +106,62 @@ def test_a_second_one_computes_only_the_model(
     monkeypatch.setattr(module._Mutual, "match_unit", refuse)
     reconstruct([photographs], again)
     assert len(Capture.open(again)["ios_map"].images) == 6
+
+
+def test_known_cameras_and_rough_poses(photographs: Path, small_capture: Path, tmp_path: Path) -> None:
+    session, rng = Capture.open(small_capture)["ios_map"], np.random.default_rng(0)
+    true, camera = session.world_from_cam(), session.camera(session.images["sensor_id"].iloc[0])
+    table, prior = tmp_path / "cameras.txt", tmp_path / "prior.csv"
+    names = sorted(path.name for path in photographs.glob("0*"))
+    params = " ".join(map(str, camera.params))
+    table.write_text("\n".join(f"{name} {camera.model.name} {camera.width} {camera.height} {params}" for name in names))
+    rough = true @ np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes
+    rough[:, :3, 3] += 0.03 * rng.normal(size=(len(true), 3))
+    rows = [",".join(map(str, (name, *qt))) for name, qt in zip(names, qt_from_pose(rough), strict=True)]
+    prior.write_text("\n".join(["image,qw,qx,qy,qz,tx,ty,tz", *rows]))
+    result = reconstruct([photographs], tmp_path / "PLACE", table=table, poses_prior=prior, axes="opengl")
+    capture = Capture.open(tmp_path / "PLACE")
+    found = capture["ios_map"]
+    assert capture.unit == "m"
+    assert camera_text(found.camera(found.images["sensor_id"].iloc[0])) == camera_text(camera)
+    apart = true[:, :3, 3] - found.world_from_cam()[:, :3, 3]
+    assert np.linalg.norm(apart, axis=1).max() < 0.08
+    assert relative_rotations_deg(found.world_from_cam(), true).max() < 0.2
+    assert "rough poses" in result.report.record["meters"]
+
+
+def test_tables_about_other_photographs(photographs: Path, tmp_path: Path) -> None:
+    table = tmp_path / "table.csv"
+    table.write_text("image,model,width,height,params\nother.jpg,PINHOLE,64,48,50 50 32 24\n")
+    with pytest.raises(CaptureError, match=r"table.csv.*other.jpg.*expected '000"):
+        reconstruct([photographs], tmp_path / "PLACE", table=table)
+    with pytest.raises(ManifestError, match="poses-prior"):
+        reconstruct([photographs], tmp_path / "PLACE", poses_prior=table, positions=table)
+
+
+def test_two_cameras_with_one_center_do_not_bend_the_model() -> None:
+    """Cameras of a rig often have one center, and COLMAP fixes the scale by the distance of two cameras."""
+    rng, camera = np.random.default_rng(0), pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=480, camera_id=1)
+    camera.params = [600.0, 320.0, 240.0]
+    centers, points = rng.uniform(-3, 3, (10, 3)) * [1, 1, 0.3], rng.uniform([-3, -3, 7], [3, 3, 13], (150, 3))
+    centers[1] = centers[0]
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
+    seen = points[None] - centers[:, None]
+    pixels = 600 * seen[..., :2] / seen[..., 2:] + [320, 240]
+    for number, center in enumerate(centers + 0.05 * rng.normal(size=centers.shape), start=1):
+        image = pycolmap.Image(name=f"{number}", camera_id=1, image_id=number, keypoints=pixels[number - 1])
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), -center))
+    for row, point in enumerate(points + 0.05 * rng.normal(size=points.shape)):
+        track = [pycolmap.TrackElement(number, row) for number in range(1, len(centers) + 1)]
+        model.add_point3D(point, pycolmap.Track(track))
+    work = object.__new__(module._Work)
+    work.cameras, work.camera_ids, work.known = [camera], [1], {0}
+    work._refine(model)
+    ours = np.stack([model.image(number).projection_center() for number in range(1, len(centers) + 1)])
+    found = pycolmap.estimate_sim3d(ours, centers)
+    assert found is not None
+    assert np.linalg.norm(found * ours - centers, axis=1).max() < 1e-6
 
 
 @pytest.mark.slow
@@ -203,7 +260,7 @@ def test_cameras_are_shared_by_folder_size_and_tags(tmp_path: Path) -> None:
     for number, width in enumerate((60, 70, 80, 80)):
         write(f"c/{number}.jpg", (width, 48))
     found, _ = gather([tmp_path], tmp_path / "PLACE/reconstruction/images")
-    numbers, cameras = initial_cameras(found, None)
+    numbers, cameras = initial_cameras(found, {})
     assert numbers == [0, 0, 1, 2, 2, 3, 4, 5, 6]
     assert cameras[0].mean_focal_length() == pytest.approx(28 * 80 / np.hypot(36, 24))
     assert cameras[0].has_prior_focal_length
