@@ -16,6 +16,7 @@ from toolkit.capture import Capture
 from toolkit.capture.cameras import camera_text
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange import reconstruct as module
+from toolkit.exchange.grow import add_recording
 from toolkit.exchange.photographs import choose_frames, gather, initial_cameras
 from toolkit.exchange.reconstruct import reconstruct
 from toolkit.features.sift import SiftExtractor
@@ -128,6 +129,40 @@ def test_known_cameras_and_rough_poses(photographs: Path, small_capture: Path, t
     assert np.linalg.norm(apart, axis=1).max() < 0.08
     assert relative_rotations_deg(found.world_from_cam(), true).max() < 0.2
     assert "rough poses" in result.report.record["meters"]
+
+
+@pytest.mark.slow
+def test_a_rig_of_folders(small_capture: Path, tmp_path: Path) -> None:
+    session, folder = Capture.open(small_capture)["spot_map"], tmp_path / "photographs"
+    assert session.rigs is not None
+    truth = {}
+    for row, (time, sensor) in enumerate(zip(session.images["timestamp"], session.images["sensor_id"], strict=True)):
+        name = f"{sensor.rpartition('/')[2]}/{time}{session.image_path(row).suffix}"
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(session.image_path(row), folder / name)
+        truth[name] = session.rig_from_cam([row])[0]
+    reconstruct([folder], tmp_path / "PLACE", "spot", rig="folders", hold_out=4)
+    capture = Capture.open(tmp_path / "PLACE")
+    for found in (capture["spot_map"], capture["spot_query"]):
+        assert found.rigs is not None
+        assert len(found.rigs) == found.images["sensor_id"].nunique() == 3
+        assert found.images["timestamp"].nunique() == len(found.images) / len(found.rigs)
+        names = found.own_names([np.array([row]) for row in range(len(found.images))])
+        ours, true = found.rig_from_cam(), np.stack([truth[name] for name in names])
+        assert relative_rotations_deg(ours, true).max() < 1.0
+    with pytest.raises(CaptureError, match="has rigs"):
+        add_recording([folder], tmp_path / "PLACE", "spot")
+
+
+def test_rigs_that_are_none(photographs: Path, tmp_path: Path) -> None:
+    config = tmp_path / "rig.json"
+    single = '[{"cameras": [{"image_prefix": "a/", "ref_sensor": true}]}]'
+    for text, message in (("{", "COLMAP reads"), (single, "two cameras")):
+        config.write_text(text)
+        with pytest.raises(CaptureError, match=message):
+            reconstruct([photographs], tmp_path / "PLACE", rig=config)
+    with pytest.raises(CaptureError, match="two cameras"):
+        reconstruct([photographs], tmp_path / "PLACE", rig="folders")
 
 
 def test_tables_about_other_photographs(photographs: Path, tmp_path: Path) -> None:

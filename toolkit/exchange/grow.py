@@ -113,7 +113,10 @@ def _model(folder: Path, session: Path) -> pycolmap.Reconstruction:
     path = folder / "models" / "0"
     if not (session / RECORD).is_file() or not path.is_dir():
         raise CaptureError(f"{session} exists, but was not reconstructed here, so nothing can be added to its model.")
-    return pycolmap.Reconstruction(str(path))
+    model = pycolmap.Reconstruction(str(path))
+    if any(rig.num_sensors() > 1 for rig in model.rigs.values()):
+        raise CaptureError(f"{session} has rigs, so it does not grow. Reconstruct all its photographs with --replace.")
+    return model
 
 
 def _photographs(base: pycolmap.Reconstruction, folder: Path, session: Path) -> dict[int, Photograph]:

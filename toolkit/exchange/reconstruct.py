@@ -32,6 +32,7 @@ from toolkit.exchange.georeference import RECORD, place, read_positions
 from toolkit.exchange.import_report import ImportReport
 from toolkit.exchange.interchange import once, read_intrinsics, read_poses
 from toolkit.exchange.photographs import TAKEN_SUFFIXES, Photograph, gather, initial_cameras
+from toolkit.exchange.rigs import Prefixes, join, read_rigs
 from toolkit.features.features import KINDS, LocalFeatures
 from toolkit.features.matching import (
     LocalMethod,
@@ -103,10 +104,10 @@ class _Work:
 
     def __init__(
         self, folder: Path, device: str, photographs: list[Photograph], known: Mapping[str, pycolmap.Camera],
-        prior: Mapping[str, Floats] | None = None,
+        prior: Mapping[str, Floats] | None = None, rigs: Prefixes | None = None,
     ) -> None:  # fmt: skip
-        self.folder, self.photographs = folder, photographs
-        self.camera_of, self.cameras = initial_cameras(photographs, known)
+        self.folder, self.photographs, self.rigs = folder, photographs, rigs or []
+        self.camera_of, self.cameras = initial_cameras(photographs, known, self.rigs)
         self.known = {number for number, item in zip(self.camera_of, photographs, strict=True) if item.name in known}
         """Numbers of the cameras whose intrinsics stay as they are."""
         session = folder / "sessions" / f"{device}_map"
@@ -215,7 +216,8 @@ class _Work:
                 prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
                 prior.corr_data_id = pycolmap.data_t(pycolmap.sensor_t(sensor, model.image(number).camera_id), number)
                 priors.append(prior)
-        pycolmap.create_pose_prior_bundle_adjuster(options, found, config, priors, model).solve()
+        with _quiet():
+            pycolmap.create_pose_prior_bundle_adjuster(options, found, config, priors, model).solve()
 
     def match(self, kind: int, pairs: Sequence[tuple[int, int]]) -> None:
         """Match pairs and keep the matches that agree with one relative pose of their cameras."""
@@ -306,6 +308,9 @@ class _Work:
             kept = ordered[:1] + [model for model in ordered[1:] if not {*model.reg_image_ids()} <= inside]
             for model in tqdm(kept, "refine", unit="model"):
                 self._refine(model)
+            if self.rigs and kept:
+                join(kept[0], database, self.rigs, self.names[0].removesuffix(self.photographs[0].name))
+                self._refine(kept[0])
         return [model for model in kept if model.num_reg_images() >= MIN_MODEL]
 
     def _incremental_options(self) -> pycolmap.IncrementalPipelineOptions:
@@ -333,9 +338,11 @@ class _Work:
         for _ in range(2):
             pycolmap.create_default_bundle_adjuster(self._adjustment(), self._of_model(model, fixed), model).solve()
             pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX * scale, MIN_ANGLE_DEG)
-            for image in list(model.images.values()):  # a wrong pose keeps few points
-                if image.has_pose and image.num_points3D < MIN_POINTS and image.image_id not in fixed:
-                    model.deregister_frame(image.frame_id)
+            for frame in list(model.frames.values()):  # a wrong pose keeps few points
+                images = [model.image(data.id) for data in frame.image_ids]
+                few = sum(image.num_points3D for image in images) < MIN_POINTS
+                if frame.has_pose and few and not any(image.image_id in fixed for image in images):
+                    model.deregister_frame(frame.frame_id)
 
     @property
     def _image_scale(self) -> float:
@@ -381,7 +388,8 @@ def _quiet() -> Iterator[None]:
 def reconstruct(
     sources: Sequence[str | Path], capture: str | Path, device: str = "ios", fps: float | None = None,
     camera: str | None = None, distance: tuple[str, str, float] | None = None, mapper: str = "incremental",
-    table: str | Path | None = None, poses_prior: str | Path | None = None, **options: Any,
+    table: str | Path | None = None, poses_prior: str | Path | None = None,
+    rig: str | Path | None = None, **options: Any,
 ) -> Reconstruction:  # fmt: skip
     """Make a map session from photographs without poses, and with `hold_out` a query session with ground truth.
 
@@ -400,6 +408,8 @@ def reconstruct(
         distance: two points, `IMAGE:x,y` in pixels, or images for the centers of their cameras, and the meters
             between.
         mapper: COLMAP's `incremental` or `global` mapper.
+        rig: `folders` if the folders are the cameras of one rig, whose photographs with equal names were taken at the
+            same time, or COLMAP's rig_config.json, see `rigs.read_rigs`; each folder is one camera then.
         options: see `drafts.Options`; GPS in EXIF is used in any case.
 
     Raises:
@@ -430,7 +440,9 @@ def reconstruct(
     prior = read_poses(Path(poses_prior), "world_from_cam")[1] if poses_prior is not None else {}
     prior = {name: pose @ AXES[axes] for name, pose in prior.items()}
     prior = _of_photographs(prior, photographs, poses_prior) if prior else prior
-    work = _Work(folder, device, photographs, cameras, prior)
+    rigs = read_rigs(rig, photographs) if rig is not None else []
+    work = _Work(folder, device, photographs, cameras, prior, rigs)
+    draft.frames_are_names = not rigs
     held = every_nth([item.name for item in work.photographs], draft.hold_out)
     work.unusable |= unreadable
     matcher = _Mutual(RATIO, shorten=KINDS["sift"].shorten)
@@ -448,7 +460,7 @@ def reconstruct(
     model = models[0]
     geo = {item.name: item.geo for item in work.photographs if item.geo is not None}
     placed = place(model, {item.name: item.quarter_turns for item in work.photographs}, geo, distance, known, prior)
-    if placed.prior_noise_m is not None:
+    if placed.prior_noise_m is not None and not rigs:  # COLMAP's position priors are of single cameras
         work.hold_to_prior(model, placed.prior_noise_m)
     paths = [folder / "models" / str(number) for number in range(len(models))]
     shutil.rmtree(folder / "models")
@@ -478,7 +490,7 @@ def reconstruct(
         where = ", ".join(f"{size} in {path}" for size, path in zip(sizes[1:], paths[1:], strict=True))
         draft.notes.append(f"not connected to it, so not used: models of {where}")
     draft.notes += placed.notes
-    report = draft.finish({name for name in held if name in draft.poses})
+    report = draft.finish(None if rigs else {name for name in held if name in draft.poses})
     for one in filter(None, (report, report.held_out)):
         write_text(one.session / RECORD, json.dumps(record, indent=1) + "\n")
         _hand_over(work, one.session)
@@ -502,8 +514,16 @@ def add_posed(draft: Draft, item: Photograph, image: pycolmap.Image, sensor: str
     """Add a photograph with its camera and pose in a model to a session."""
     draft.convention, draft.unit_hint = "found by structure from motion", UNIT_HINT
     assert image.camera is not None
-    draft.images.append(DraftImage(item.name, image.camera, sensor, item.name, origin=origin))
-    draft.poses[item.name] = inverse(image.cam_from_world())
+    frame = image.frame
+    assert frame is not None
+    assert frame.rig is not None
+    assert frame.rig_from_world is not None
+    in_rig = frame.rig.num_sensors() > 1
+    key, rig = (f"{frame.frame_id}", f"{SUBSESSION}/rig_{frame.rig_id}") if in_rig else (item.name, None)
+    draft.images.append(DraftImage(item.name, image.camera, sensor, key, rig, origin))
+    draft.poses[key] = inverse(frame.rig_from_world)
+    if rig is not None and all(row[:2] != (rig, sensor) for row in draft.rigs):
+        draft.rigs.append((rig, sensor, inverse(image.cam_from_world() * frame.rig_from_world.inverse())))
     draft.sources[item.name] = item.path
     if item.mask is not None:
         draft.mask_files[item.name] = item.mask
