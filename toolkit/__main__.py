@@ -675,6 +675,7 @@ def export_exif(
     out: Annotated[Path, Argument(help="Folder for copies of the pictures.")],
     capture: Capture = None,
     unsure: Annotated[bool, Option("--unsure", help="Also poses of low confidence.")] = False,
+    xmp: Annotated[bool, Option("--xmp", help="XMP files to lie beside the pictures, instead of copies.")] = False,
 ) -> None:
     """Write position and direction into copies of the query pictures of a run in maps with GPS."""
 
