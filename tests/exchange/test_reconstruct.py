@@ -87,10 +87,10 @@ def test_every_photograph_has_a_row(place: Path) -> None:
 def test_a_run_takes_the_features(place: Path, tmp_path: Path) -> None:
     for name in ("ios_map", "ios_query"):
         session = Capture.open(place)[name]
-        made = next((session.path / "proc/features").glob("sift-*/*.shard"))
+        made = sorted(shard.name for shard in (session.path / "proc/features").glob("sift-*/*.shard"))
         store = extract_session(session, tmp_path)
         path = features_path(tmp_path, name, SiftExtractor().settings)
-        assert [shard.name for shard in path.glob("*.shard")] == [made.name]
+        assert sorted(shard.name for shard in path.glob("*.shard")) == made
         assert set(session.image_names) <= set(store)
 
 
@@ -129,6 +129,17 @@ def test_known_cameras_and_rough_poses(photographs: Path, small_capture: Path, t
     assert np.linalg.norm(apart, axis=1).max() < 0.08
     assert relative_rotations_deg(found.world_from_cam(), true).max() < 0.2
     assert "rough poses" in result.report.record["meters"]
+    with pycolmap.Database.open(str(tmp_path / "PLACE" / module.FOLDER / "database.db")) as database:
+        assert database.num_pose_priors() == len(true)  # for the mapper
+
+
+def test_neighbors_by_rough_poses_look_into_similar_directions() -> None:
+    work, back = object.__new__(module._Work), np.diag([-1.0, 1.0, -1.0, 1.0])
+    work.prior = np.stack([np.eye(4), np.eye(4), back, np.full((4, 4), np.nan)])
+    work.prior[1, 0, 3] = 2.0
+    apart = work._apart_by_prior()
+    assert apart[0, 1] == apart[1, 0] == 2
+    assert np.isinf(np.delete(apart.ravel(), [1, 4])).all()
 
 
 @pytest.mark.slow

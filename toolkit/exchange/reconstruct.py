@@ -67,6 +67,7 @@ LOSS_PX, MAX_ERROR_PX, MIN_ANGLE_DEG = 0.5, 4.0, 1.5
 """Of the last bundle adjustment: scale of the Cauchy loss and largest error of an observation, in pixels of the image
 where features are detected, and smallest triangulation angle."""
 FEW_PAIRS, STRONGEST = 100, 2048  # if there are more pairs, only so many SIFT features of each photograph are matched
+MAPPED_NOISE_M = 0.2  # of the positions of rough poses in COLMAP's mapper, whose loss is robust; drift adds to noise
 MAX_VIEW_DEG = 60.0  # largest angle between the optical axes of images that are neighbors by rough poses
 MIN_POINTS = 30  # points of a photograph in a model; COLMAP requires as many when it estimates a pose
 _BATCH = 64  # pairs that are matched at once
@@ -205,17 +206,8 @@ class _Work:
         options, config = self._adjustment(), self._of_model(model)
         found = pycolmap.PosePriorBundleAdjustmentOptions()
         found.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        sensor = pycolmap.SensorType.CAMERA
-        priors = []
-        for image, number in enumerate(self.image_ids):
-            if np.isfinite(self.prior[image]).all() and number in model.reg_image_ids():
-                prior = pycolmap.PosePrior(
-                    position=self.prior[image, :3, 3], position_covariance=noise_m**2 * np.eye(3)
-                )
-                prior.pose_prior_id = number
-                prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
-                prior.corr_data_id = pycolmap.data_t(pycolmap.sensor_t(sensor, model.image(number).camera_id), number)
-                priors.append(prior)
+        registered = set(model.reg_image_ids())
+        priors = [prior for prior in self._position_priors(noise_m) if prior.pose_prior_id in registered]
         with _quiet():
             pycolmap.create_pose_prior_bundle_adjuster(options, found, config, priors, model).solve()
 
@@ -243,6 +235,19 @@ class _Work:
                 self.matched[pair] = max(count, self.matched.get(pair, 0))
                 if len(inliers) >= MIN_INLIERS:
                     self.pairs[kind][pair] = inliers
+
+    def _position_priors(self, noise_m: float) -> list[pycolmap.PosePrior]:
+        """Return the positions of rough poses, with the number of the image as that of the prior."""
+        priors = []
+        for image in np.flatnonzero(np.isfinite(self.prior).all(axis=(1, 2))).tolist():
+            number, camera_id = self.image_ids[image], self.camera_ids[self.camera_of[image]]
+            prior = pycolmap.PosePrior(
+                position=self.prior[image, :3, 3], position_covariance=noise_m**2 * np.eye(3)
+            )
+            prior.pose_prior_id, prior.coordinate_system = number, pycolmap.PosePriorCoordinateSystem.CARTESIAN
+            prior.corr_data_id = pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id), number)
+            priors.append(prior)
+        return priors
 
     def inliers(self) -> Ints:
         """(N, N) numbers of verified matches."""
@@ -274,6 +279,8 @@ class _Work:
                 offsets[1:, image] = np.cumsum([len(part) for part in keypoints])
                 points = self.in_model.get(number, np.concatenate(keypoints))
                 database.write_keypoints(number, points.astype(np.float32))
+            for prior in self._position_priors(MAPPED_NOISE_M):
+                database.write_pose_prior(prior, True)
             both: dict[tuple[int, int], list[Ints]] = {}
             for kind, found in enumerate(self.pairs):
                 for pair, indices in found.items():
@@ -321,6 +328,8 @@ class _Work:
         options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
         options.ba_global_function_tolerance = options.ba_local_function_tolerance = 1e-4
         options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
+        if np.isfinite(self.prior).any():
+            options.use_prior_position = options.use_robust_loss_on_prior_position = True
         if len(self.known) == len(self.cameras):  # else `_refine` restores them: COLMAP's `constant_cameras` move
             options.ba_refine_focal_length = options.ba_refine_extra_params = False
             options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
