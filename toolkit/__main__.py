@@ -99,7 +99,7 @@ _FAILED = (
 _SOURCES = "Image files, folders of images (a camera each) and videos; the last one is the folder of the new capture."
 _HELD_OUT = "Every Nth photograph becomes a query with truth, and the map is run and evaluated on them; 0: none."
 _REMOVE = "Remove the images of a folder, file or video that was added; give only CAPTURE."
-_TABLE = "CSV: image,model,width,height,params, or hloc's list: known cameras."
+_KNOWN = "CSV: image,model,width,height,params, or hloc's list: known cameras."
 _PRIOR = "CSV: image,qw,qx,qy,qz,tx,ty,tz of a device's tracking, meters; the map gets its world."
 _RIG = "`folders`: each is a camera of one rig, equal names were taken at once; or COLMAP's rig_config.json."
 _DISTANCE = "Meters between two points, given by a pixel each, or between the cameras of two images."
@@ -535,7 +535,7 @@ def reconstruct(
         tuple[str, str, float] | None, Option(metavar="IMAGE:X,Y IMAGE:X,Y METERS", help=_DISTANCE)
     ] = None,
     positions: Positions = None,
-    table: Annotated[Path | None, Option(help=_TABLE)] = None,
+    table: Annotated[Path | None, Option(help=_KNOWN)] = None,
     poses_prior: Annotated[Path | None, Option(metavar="TABLE", help=_PRIOR)] = None, axes: Axes = "opencv",
     rig: Annotated[str | None, Option(metavar="folders|FILE", help=_RIG)] = None,
     mapper: Annotated[str, Option(metavar="incremental|global", help="COLMAP's mapper.")] = "incremental",
