@@ -1,47 +1,71 @@
 """Photographs without poses to a model: `toolkit reconstruct` beside COLMAP's own pipeline, on the same files.
 
     python benchmarks/reconstruct.py [--capture PATH]... [--images FOLDER --truth CSV] [--threads 2] [--only TEXT]
-                                     [--methods toolkit,global,colmap] [--out FILE]
+                                     [--methods toolkit,known,global,colmap,hloc,given] [--queries]
+                                     [--hloc CHECKOUT [--hloc-python PYTHON]] [--out FILE]
 
 Each recording of each map session of a capture, and a folder of images with a table of poses, is a set of its own:
-links to its files, in a folder per camera. COLMAP has its defaults (SIFT, all pairs, the incremental mapper, a camera
+links to its files, in a folder per camera. `known` is the toolkit with the capture's intrinsics, `given` the capture's
+own map. COLMAP has its defaults (SIFT, all pairs, the incremental mapper, a camera
 per folder) without GPU. Without input, one rendered room is measured. Errors are those of all registered photographs
 after a similarity to the true poses: rotation from all orientations, then scale and shift from the positions.
+`--queries` localizes the capture's queries of the same device and place, with their given intrinsics, in each map of
+the toolkit after this similarity, with default settings.
 """
 
 import argparse
+import json
 import os
 import shutil
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from common import add_out, check_out, in_own_process, limit_cores, markdown_table, write_out
 
 from toolkit.geometry import Floats
 
-Sets = dict[str, tuple[Path, dict[str, Floats]]]
+
+class Photographs(NamedTuple):
+    """Photographs of one recording, with what is known of them."""
+
+    images: Path
+    truth: dict[str, Floats]  # world_from_cam (4, 4) by name
+    session: Path | None = None  # of the map, in a capture
+    part: str = ""  # its recording
+    table: Path | None = None  # intrinsics, as `reconstruct --table` takes them
+
+
+Sets = dict[str, Photographs]
 
 
 def sets_of_capture(path: Path, folder: Path) -> Sets:
-    """Link the images of each recording of a map; return the folders, and true world_from_cam by name."""
+    """Link the images of each recording of a map."""
     from toolkit.capture import Capture
+    from toolkit.capture.cameras import camera_text
 
     sets: Sets = {}
     for session in Capture.open(path).usable("map"):
         poses, names = session.world_from_cam(), session.subsession_of(np.arange(len(session.images)))
         for row, (part, sensor) in enumerate(zip(names, session.images["sensor_id"], strict=True)):
             name = f"{path.name} {session.device} {part}"
-            target, truth = sets.setdefault(name, (folder / name.replace(" ", "_"), {}))
+            target = folder / name.replace(" ", "_")
+            made = Photographs(target, {}, session.path, part, target.with_suffix(".txt"))
+            made = sets.setdefault(name, made)
             camera = sensor.rpartition("/")[2] if session.rigs is not None else ""
             own = str(Path(camera) / session.image_path(row).name)
             (target / own).parent.mkdir(parents=True, exist_ok=True)
             (target / own).symlink_to(session.image_path(row).resolve())
-            truth[own] = poses[row]
+            made.truth[own] = poses[row]
+            assert made.table is not None
+            with made.table.open("a") as stream:
+                stream.write(f"{own} {camera_text(session.camera(sensor)).replace(',', '')}\n")
     return sets
 
 
@@ -54,22 +78,26 @@ def set_of_table(images: Path, table: Path) -> Sets:
 
     rows = pd.read_csv(table)
     poses = pose_from_qt(rows[list(POSE_NAMES)].to_numpy(float))
-    return {f"{images.parent.name} {images.name}": (images.resolve(), dict(zip(rows["image"], poses, strict=True)))}
+    truth = dict(zip(rows["image"], poses, strict=True))
+    return {f"{images.parent.name} {images.name}": Photographs(images.resolve(), truth)}
 
 
-def run_toolkit(images: Path, work: Path, threads: int, mapper: str) -> dict[str, Floats]:
+def run_toolkit(photographs: Photographs, work: Path, threads: int, mapper: str, known: bool) -> dict[str, Floats]:
     """Return world_from_cam by name."""
     from toolkit.capture import Capture
     from toolkit.exchange.reconstruct import reconstruct
 
-    reconstruct([images], work / "PLACE", mapper=mapper)
-    session = Capture.open(work / "PLACE")["ios_map"]
+    device = "ios" if photographs.session is None else photographs.session.name.removesuffix("_map")
+    table = photographs.table if known else None
+    reconstruct([photographs.images], work / "PLACE", device, mapper=mapper, table=table)
+    (session,) = Capture.open(work / "PLACE").usable("map")
     names = session.own_names([np.array([row]) for row in range(len(session.images))])
     return dict(zip(names, session.world_from_cam(), strict=True))
 
 
-def run_colmap(images: Path, work: Path, threads: int) -> dict[str, Floats]:
+def run_colmap(photographs: Photographs, work: Path, threads: int) -> dict[str, Floats]:
     """Return world_from_cam by name."""
+    images = photographs.images
     import pycolmap
 
     from toolkit.geometry import make_pose
@@ -91,35 +119,111 @@ def run_colmap(images: Path, work: Path, threads: int) -> dict[str, Floats]:
     return {name: make_pose(pose.rotation.matrix(), pose.translation) for name, pose in poses.items()}
 
 
-METHODS: dict[str, Callable[[Path, Path, int], dict[str, Floats]]] = {
-    "toolkit": partial(run_toolkit, mapper="incremental"),
-    "global": partial(run_toolkit, mapper="global"),
+def run_hloc(photographs: Photographs, work: Path, threads: int) -> dict[str, Floats]:
+    """Return world_from_cam by name; hloc's interpreter and checkout are in the environment."""
+    from toolkit.geometry import invert
+
+    worker = str(Path(__file__).with_name("hloc_reconstruct.py"))
+    arguments = [os.environ["HLOC"], str(photographs.images), str(work), str(threads)]
+    with open(work / "log", "w", encoding="utf-8") as log:
+        subprocess.run([os.environ["HLOC_PYTHON"], worker, *arguments], stdout=log, stderr=log, check=True)
+    found = json.loads((work / "poses.json").read_text())["poses"]
+    return {name: invert(np.vstack([pose, [0, 0, 0, 1]])) for name, pose in found.items()}
+
+
+def take_given(photographs: Photographs, work: Path, threads: int) -> dict[str, Floats]:
+    """Copy the capture's own map; return its poses."""
+    if photographs.session is None:
+        return {}
+    part_of_session(photographs.session, work / "PLACE" / "sessions" / photographs.session.name, photographs.part)
+    return photographs.truth
+
+
+METHODS: dict[str, Callable[[Photographs, Path, int], dict[str, Floats]]] = {
+    "toolkit": partial(run_toolkit, mapper="incremental", known=False),
+    "known": partial(run_toolkit, mapper="incremental", known=True),
+    "global": partial(run_toolkit, mapper="global", known=False),
     "colmap": run_colmap,
+    "hloc": run_hloc,
+    "given": take_given,
 }
+
+
+def part_of_session(session: Path, target: Path, part: str) -> None:
+    """Copy a recording of a session."""
+    for path in [*session.glob("*.txt"), *session.glob("proc/*.txt")]:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        kept = [line for line in lines if line.startswith("#") or part in line]
+        (target / path.relative_to(session)).parent.mkdir(parents=True, exist_ok=True)
+        (target / path.relative_to(session)).write_text("\n".join(kept) + "\n", encoding="utf-8")
+    shutil.copytree(session / "raw_data" / part, target / "raw_data" / part)
+
+
+def ask_queries(photographs: Photographs, place: Path, poses: dict[str, Floats]) -> tuple[list[float], list[float]]:
+    """Localize the queries of the same place in a map, moved to the truth; return errors in degrees and meters."""
+    from toolkit import embed, localize, retrieve
+    from toolkit.capture import Capture, Session, Trajectory
+    from toolkit.evaluate import evaluate_scene
+    from toolkit.files import SceneFiles
+    from toolkit.geometry import make_pose
+
+    assert photographs.session is not None
+    device = photographs.session.name.removesuffix("_map")
+    given = Capture.open(photographs.session.parents[1])
+    number = given[f"{device}_map"].subsessions.index(photographs.part)
+    queries, root = given[f"{device}_query"], place / "sessions"
+    part_of_session(queries.path, root / f"{device}_query", queries.subsessions[number])
+    session = Session.open(root / f"{device}_map")
+    if session.rigs is None and poses is not photographs.truth:
+        rotation, scale, shift = similarity(poses, photographs.truth)
+        own = session.own_names([np.array([row]) for row in range(len(session.images))])
+        ours = np.stack([poses[name] for name in own])
+        ours = make_pose(rotation @ ours[:, :3, :3], scale * ours[:, :3, 3] @ rotation.T + shift)
+        times, sensors = session.images["timestamp"].tolist(), session.images["sensor_id"].tolist()
+        Trajectory.from_poses(times, sensors, ours).write(session.path / "trajectories.txt")
+        record = json.loads((session.path / "proc/import.json").read_text())
+        (session.path / "proc/import.json").write_text(json.dumps(record | {"unit": "m"}))
+    files = SceneFiles(place / "run", place.name)
+    embed.embed_sessions(root, files.embeddings, features_dir=files.features)
+    retrieve.retrieve_pairs(root, files.embeddings, out_jsonl=files.retrieval_dir, queries="all")
+    localize.localize_pairs(root, files.retrieval_dir, files.poses_dir, files.features, files.maps, queries="all")
+    found = evaluate_scene(root, files.poses_dir, None, None, queries="all").errors
+    return found["rotation_error_deg"].tolist(), found["translation_error_m"].tolist()
+
+
+def similarity(estimated: dict[str, Floats], truth: dict[str, Floats]) -> tuple[Floats, float, Floats]:
+    """Return rotation (3, 3) from all orientations, and scale and shift (3,) from positions, to the truth."""
+    from toolkit.alignment.robust import nearest_rotation
+
+    names = sorted(set(estimated) & set(truth))
+    ours, true = (np.stack([poses[name] for name in names]) for poses in (estimated, truth))
+    rotation = nearest_rotation(np.einsum("nij,nkj->ik", true[:, :3, :3], ours[:, :3, :3])[None])[0]
+    turned, centers = ours[:, :3, 3] @ rotation.T, true[:, :3, 3]
+    a, b = turned - turned.mean(axis=0), centers - centers.mean(axis=0)
+    scale = float((a * b).sum() / (a**2).sum())
+    return rotation, scale, centers.mean(axis=0) - scale * turned.mean(axis=0)
 
 
 def errors(estimated: dict[str, Floats], truth: dict[str, Floats]) -> tuple[Floats, Floats]:
     """Return rotation (degrees) and position errors (meters) after a similarity to the truth."""
-    from toolkit.alignment.robust import nearest_rotation
-
     names = sorted(set(estimated) & set(truth))
     if len(names) < 3:
         return np.full(1, np.nan), np.full(1, np.nan)
     ours, true = (np.stack([poses[name] for name in names]) for poses in (estimated, truth))
-    rotation = nearest_rotation(np.einsum("nij,nkj->ik", true[:, :3, :3], ours[:, :3, :3])[None])[0]
-    turned, centers = ours[:, :3, 3] @ rotation.T, true[:, :3, 3]
-    turned, centers = turned - turned.mean(axis=0), centers - centers.mean(axis=0)
-    scale = (turned * centers).sum() / (turned**2).sum()
+    rotation, scale, shift = similarity(estimated, truth)
+    meters = np.linalg.norm(scale * ours[:, :3, 3] @ rotation.T + shift - true[:, :3, 3], axis=1)
     apart = np.einsum("nji,jk,nkl->nil", true[:, :3, :3], rotation, ours[:, :3, :3])
     # Small angles from the skew part, where the trace has lost its digits.
     skew = apart - apart.transpose(0, 2, 1)
     sines = np.linalg.norm(skew.reshape(-1, 9), axis=1) / (2 * np.sqrt(2))
     angles = np.arctan2(sines, (np.trace(apart, axis1=1, axis2=2) - 1) / 2)
-    return np.degrees(angles), np.linalg.norm(scale * turned - centers, axis=1)
+    return np.degrees(angles), meters
 
 
-def measure(method: str, images: Path, threads: int) -> tuple[float, float, dict[str, Floats]]:
-    """Run a method in this process; return wall and CPU seconds and poses."""
+def measure(
+    method: str, photographs: Photographs, threads: int, ask: bool
+) -> tuple[float, float, dict[str, Floats], tuple[list[float], list[float]]]:
+    """Run a method in this process; return wall and CPU seconds, poses, and errors of queries."""
     import pycolmap  # noqa: F401 - imports are not timed
 
     import toolkit.exchange.reconstruct  # noqa: F401
@@ -127,12 +231,18 @@ def measure(method: str, images: Path, threads: int) -> tuple[float, float, dict
     with tempfile.TemporaryDirectory() as folder:
         cpu, wall = os.times(), time.perf_counter()
         try:
-            poses = METHODS[method](images, Path(folder), threads)
+            poses = METHODS[method](photographs, Path(folder), threads)
         except Exception as error:  # a method that fails is a row, not the end
             print(f"{method}: {error}")
             poses = {}
-        end = os.times()
-        return time.perf_counter() - wall, end.user + end.system - cpu.user - cpu.system, poses
+        end, wall_s = os.times(), time.perf_counter() - wall
+        place = Path(folder) / "PLACE"
+        asked: tuple[list[float], list[float]] = ([], [])
+        if ask and place.is_dir() and photographs.session is not None:
+            asked = ask_queries(photographs, place, poses)
+        # hloc runs in a child process
+        cpu_s = sum(end[:4]) - sum(cpu[:4])
+        return wall_s, cpu_s, poses, asked
 
 
 def main() -> None:
@@ -142,11 +252,18 @@ def main() -> None:
     parser.add_argument("--truth", type=Path)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--only", default="", help="only sets whose names contain this text")
-    parser.add_argument("--methods", default=",".join(METHODS))
+    parser.add_argument("--methods", default="toolkit,global,colmap")
+    parser.add_argument("--queries", action="store_true", help="localize the capture's queries in the maps")
+    parser.add_argument("--hloc", help="checkout of cvg/Hierarchical-Localization, for the method hloc")
+    parser.add_argument("--hloc-python", default=sys.executable, help="interpreter with hloc's needs (default: this)")
     add_out(parser)
     arguments = parser.parse_args()
     check_out(parser, arguments.out)
     limit_cores(arguments.threads)
+    if "hloc" in arguments.methods.split(","):
+        if arguments.hloc is None:
+            parser.error("hloc: give --hloc CHECKOUT.")
+        os.environ |= {"HLOC": str(Path(arguments.hloc).resolve()), "HLOC_PYTHON": arguments.hloc_python}
     folder = Path(tempfile.mkdtemp())
     try:
         captures = arguments.capture
@@ -160,24 +277,32 @@ def main() -> None:
         if arguments.images is not None:
             sets |= set_of_table(arguments.images, arguments.truth)
         rows, document = [], dict[str, Any]()
-        for name, (images, truth) in sets.items():
+        for name, photographs in sets.items():
+            truth = photographs.truth
             for method in arguments.methods.split(",") if arguments.only in name else []:
                 load = os.getloadavg()[0]
-                wall_s, cpu_s, poses = in_own_process(measure, method, images, arguments.threads)
+                job = method, photographs, arguments.threads, arguments.queries
+                wall_s, cpu_s, poses, asked = in_own_process(measure, *job)
                 degrees, meters = errors(poses, truth)
                 middle, high = (f"{np.median(meters):.4f}", f"{meters.max():.4f}")
                 rows.append([name, method, f"{len(poses)} / {len(truth)}", f"{np.median(degrees):.3f}",
                              f"{degrees.max():.3f}", middle, high, f"{wall_s:.1f}", f"{cpu_s:.1f}",
                              f"{load:.1f}"])  # fmt: skip
+                if arguments.queries:
+                    within = sum(deg < 1 and off < 0.1 for deg, off in zip(*asked, strict=True))
+                    middles = [f"{np.median(values):.3f}" if values else "" for values in asked]
+                    rows[-1] += [f"{within} / {len(asked[0])}", *middles]
                 print(*rows[-1], sep="  ", flush=True)
                 document.setdefault(name, {})[method] = {
                     "registered": len(poses), "images": len(truth), "degrees": degrees.tolist(),
                     "meters": meters.tolist(), "wall_s": wall_s, "cpu_s": cpu_s, "load_before": load,
+                    "queries": asked,
                 }  # fmt: skip
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     header = ["set", "method", "registered", "median, deg", "largest, deg", "median, m", "largest, m", "s", "CPU s",
               "load before"]  # fmt: skip
+    header += ["queries within 1 deg, 0.1 m", "deg", "m"] if arguments.queries else []
     text = markdown_table(header, rows) + "\n"
     print(text)
     write_out(arguments.out, text, document)

@@ -99,6 +99,9 @@ _FAILED = (
 _SOURCES = "Image files, folders of images (a camera each) and videos; the last one is the folder of the new capture."
 _HELD_OUT = "Every Nth photograph becomes a query with truth, and the map is run and evaluated on them; 0: none."
 _REMOVE = "Remove the images of a folder, file or video that was added; give only CAPTURE."
+_KNOWN = "CSV: image,model,width,height,params, or hloc's list: known cameras."
+_PRIOR = "CSV: image,qw,qx,qy,qz,tx,ty,tz of a device's tracking, meters; the map gets its world."
+_RIG = "`folders`: each is a camera of one rig, equal names were taken at once; or COLMAP's rig_config.json."
 _DISTANCE = "Meters between two points, given by a pixel each, or between the cameras of two images."
 _TABLE = "CSV with a header: image; qw,qx,qy,qz,tx,ty,tz for poses; camera_id, or model,width,height,params."
 
@@ -532,6 +535,9 @@ def reconstruct(
         tuple[str, str, float] | None, Option(metavar="IMAGE:X,Y IMAGE:X,Y METERS", help=_DISTANCE)
     ] = None,
     positions: Positions = None,
+    table: Annotated[Path | None, Option(help=_KNOWN)] = None,
+    poses_prior: Annotated[Path | None, Option(metavar="TABLE", help=_PRIOR)] = None, axes: Axes = "opencv",
+    rig: Annotated[str | None, Option(metavar="folders|FILE", help=_RIG)] = None,
     mapper: Annotated[str, Option(metavar="incremental|global", help="COLMAP's mapper.")] = "incremental",
     placing: Placing = "link", masks: Masks = None,
     remove: Annotated[str | None, Option(metavar="RECORDING", help=_REMOVE)] = None,
@@ -558,14 +564,15 @@ def reconstruct(
     if remove:
         tell(remove_recording(remove, capture, device))
     elif (capture / "sessions" / f"{device}_map").exists() and not replace:
-        first = {"hold-out": hold_out, "camera": camera, "distance": distance, "positions": positions, "masks": masks}
+        first = {"hold-out": hold_out, "camera": camera, "table": table, "distance": distance, "positions": positions,
+                 "poses-prior": poses_prior, "rig": rig, "masks": masks}  # fmt: skip
         if given := next((name for name, value in first.items() if value), None):
             raise ManifestError(f"--{given} is for a new map. {capture} has one, to which the photographs are added.")
         report = add_recording(photos, capture, device, fps)
     else:
         result = reconstruct(
-            photos, capture, device, fps, camera, distance, mapper, hold_out=hold_out, positions=positions,
-            placing=placing, masks=masks, replace=replace,
+            photos, capture, device, fps, camera, distance, mapper, table, poses_prior, rig,
+            hold_out=hold_out, positions=positions, placing=placing, masks=masks, axes=axes, replace=replace,
         )  # fmt: skip
         report, option = result.report, result.camera
         points = {"points": result.points, "colors": result.colors}
@@ -668,6 +675,7 @@ def export_exif(
     out: Annotated[Path, Argument(help="Folder for copies of the pictures.")],
     capture: Capture = None,
     unsure: Annotated[bool, Option("--unsure", help="Also poses of low confidence.")] = False,
+    xmp: Annotated[bool, Option("--xmp", help="XMP files to lie beside the pictures, instead of copies.")] = False,
 ) -> None:
     """Write position and direction into copies of the query pictures of a run in maps with GPS."""
 

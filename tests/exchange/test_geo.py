@@ -2,7 +2,9 @@
 
 import json
 import shutil
+from fractions import Fraction
 from pathlib import Path
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -22,6 +24,7 @@ from toolkit.geometry import Floats, make_pose
 from toolkit.localize import localize_pairs
 from toolkit.results.pair import PairResults
 
+RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 DEVICES = ("hl", "ios")
 ORIGIN = np.array([-33.8568, 151.2153, 5.0])
 
@@ -142,6 +145,19 @@ def test_copies_have_position_direction_and_the_same_pixels(localized: Path, pla
         assert image.getexif().get_ifd(0x8825)[29] == "2026:01:02"
     with pytest.raises(ManifestError):
         export_exif(localized, tmp_path / "out", placed)
+
+
+def test_xmp_beside_the_pictures(localized: Path, placed: Path, tmp_path: Path) -> None:
+    table = geo_table(localized, placed).query("status == 'ok'").drop_duplicates("image").set_index("image")
+    assert export_exif(localized, tmp_path / "out", placed, xmp=True) == len(table)
+    for name, row in table.iterrows():
+        (description,) = ElementTree.parse((tmp_path / "out" / str(name)).with_suffix(".xmp")).iter(f"{RDF}Description")
+        tags = {key.partition("}")[2]: value for key, value in description.items() if "exif" in key}
+        degrees, minutes = tags["GPSLatitude"].removesuffix("S").split(",")
+        assert -(float(degrees) + float(minutes) / 60) == pytest.approx(row["latitude_deg"], abs=1e-8)
+        assert tags["GPSLongitude"].endswith("E")
+        assert float(Fraction(tags["GPSAltitude"])) == pytest.approx(abs(row["altitude_m"]), abs=1e-3)
+        assert float(Fraction(tags["GPSImgDirection"])) == pytest.approx(row["heading_deg"] % 360, abs=0.006)
 
 
 def test_what_is_refused(localized: Path, small_capture: Path, placed: Path, tmp_path: Path) -> None:

@@ -67,6 +67,18 @@ def test_a_straight_path_keeps_up() -> None:
     assert fitted[0].scale == pytest.approx(SCALE, rel=0.02)
 
 
+@pytest.mark.slow
+def test_scale_is_as_sure_as_noise_and_spread_allow() -> None:
+    off = []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        source = rng.uniform(-5, 5, (40, 3)) * [1, 1, 0.1]  # meters; the noise spreads positions as much as this
+        fitted = fit(source / SCALE, source + rng.normal(size=source.shape) * 2)
+        assert fitted is not None
+        off.append((fitted[0].scale / SCALE - 1) / fitted[3])
+    assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.2
+
+
 def test_known_positions_of_a_model() -> None:
     model = synthetic()
     truth = {name: SCALE * center + 10 for name, center in centers(model).items()}

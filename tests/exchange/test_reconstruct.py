@@ -13,14 +13,16 @@ from typer.testing import CliRunner
 
 from toolkit.__main__ import app
 from toolkit.capture import Capture
+from toolkit.capture.cameras import camera_text
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange import reconstruct as module
+from toolkit.exchange.grow import add_recording
 from toolkit.exchange.photographs import choose_frames, gather, initial_cameras
 from toolkit.exchange.reconstruct import reconstruct
 from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import extract_session, features_path
 from toolkit.files import read_json
-from toolkit.geometry import Floats
+from toolkit.geometry import Floats, qt_from_pose
 
 
 @pytest.fixture(scope="session")
@@ -105,6 +107,107 @@ def test_a_second_one_computes_only_the_model(
     monkeypatch.setattr(module._Mutual, "match_unit", refuse)
     reconstruct([photographs], again)
     assert len(Capture.open(again)["ios_map"].images) == 6
+
+
+def test_known_cameras_and_rough_poses(photographs: Path, small_capture: Path, tmp_path: Path) -> None:
+    session, rng = Capture.open(small_capture)["ios_map"], np.random.default_rng(0)
+    true, camera = session.world_from_cam(), session.camera(session.images["sensor_id"].iloc[0])
+    table, prior = tmp_path / "cameras.txt", tmp_path / "prior.csv"
+    names = sorted(path.name for path in photographs.glob("0*"))
+    params = " ".join(map(str, camera.params))
+    table.write_text("\n".join(f"{name} {camera.model.name} {camera.width} {camera.height} {params}" for name in names))
+    rough = true @ np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes
+    rough[:, :3, 3] += 0.03 * rng.normal(size=(len(true), 3))
+    rows = [",".join(map(str, (name, *qt))) for name, qt in zip(names, qt_from_pose(rough), strict=True)]
+    prior.write_text("\n".join(["image,qw,qx,qy,qz,tx,ty,tz", *rows]))
+    result = reconstruct([photographs], tmp_path / "PLACE", table=table, poses_prior=prior, axes="opengl")
+    capture = Capture.open(tmp_path / "PLACE")
+    found = capture["ios_map"]
+    assert capture.unit == "m"
+    assert camera_text(found.camera(found.images["sensor_id"].iloc[0])) == camera_text(camera)
+    apart = true[:, :3, 3] - found.world_from_cam()[:, :3, 3]
+    assert np.linalg.norm(apart, axis=1).max() < 0.08
+    assert relative_rotations_deg(found.world_from_cam(), true).max() < 0.2
+    assert "rough poses" in result.report.record["meters"]
+    with pycolmap.Database.open(str(tmp_path / "PLACE" / module.FOLDER / "database.db")) as database:
+        assert database.num_pose_priors() == len(true)  # for the mapper
+
+
+def test_neighbors_by_rough_poses_look_into_similar_directions() -> None:
+    work, back = object.__new__(module._Work), np.diag([-1.0, 1.0, -1.0, 1.0])
+    work.prior = np.stack([np.eye(4), np.eye(4), back, np.full((4, 4), np.nan)])
+    work.prior[1, 0, 3] = 2.0
+    apart = work._apart_by_prior()
+    assert apart[0, 1] == apart[1, 0] == 2
+    assert np.isinf(np.delete(apart.ravel(), [1, 4])).all()
+
+
+@pytest.mark.slow
+def test_a_rig_of_folders(small_capture: Path, tmp_path: Path) -> None:
+    session, folder = Capture.open(small_capture)["spot_map"], tmp_path / "photographs"
+    assert session.rigs is not None
+    truth = {}
+    for row, (time, sensor) in enumerate(zip(session.images["timestamp"], session.images["sensor_id"], strict=True)):
+        name = f"{sensor.rpartition('/')[2]}/{time}{session.image_path(row).suffix}"
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(session.image_path(row), folder / name)
+        truth[name] = session.rig_from_cam([row])[0]
+    reconstruct([folder], tmp_path / "PLACE", "spot", rig="folders", hold_out=4)
+    capture = Capture.open(tmp_path / "PLACE")
+    for found in (capture["spot_map"], capture["spot_query"]):
+        assert found.rigs is not None
+        assert len(found.rigs) == found.images["sensor_id"].nunique() == 3
+        assert found.images["timestamp"].nunique() == len(found.images) / len(found.rigs)
+        names = found.own_names([np.array([row]) for row in range(len(found.images))])
+        ours, true = found.rig_from_cam(), np.stack([truth[name] for name in names])
+        assert relative_rotations_deg(ours, true).max() < 1.0
+    with pytest.raises(CaptureError, match="has rigs"):
+        add_recording([folder], tmp_path / "PLACE", "spot")
+
+
+def test_rigs_that_are_none(photographs: Path, tmp_path: Path) -> None:
+    config = tmp_path / "rig.json"
+    single = '[{"cameras": [{"image_prefix": "a/", "ref_sensor": true}]}]'
+    for text, message in (("{", "COLMAP reads"), (single, "two cameras")):
+        config.write_text(text)
+        with pytest.raises(CaptureError, match=message):
+            reconstruct([photographs], tmp_path / "PLACE", rig=config)
+    with pytest.raises(CaptureError, match="two cameras"):
+        reconstruct([photographs], tmp_path / "PLACE", rig="folders")
+
+
+def test_tables_about_other_photographs(photographs: Path, tmp_path: Path) -> None:
+    table = tmp_path / "table.csv"
+    table.write_text("image,model,width,height,params\nother.jpg,PINHOLE,64,48,50 50 32 24\n")
+    with pytest.raises(CaptureError, match=r"table.csv.*other.jpg.*expected '000"):
+        reconstruct([photographs], tmp_path / "PLACE", table=table)
+    with pytest.raises(ManifestError, match="poses-prior"):
+        reconstruct([photographs], tmp_path / "PLACE", poses_prior=table, positions=table)
+
+
+def test_two_cameras_with_one_center_do_not_bend_the_model() -> None:
+    """Cameras of a rig often have one center, and COLMAP fixes the scale by the distance of two cameras."""
+    rng, camera = np.random.default_rng(0), pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=480, camera_id=1)
+    camera.params = [600.0, 320.0, 240.0]
+    centers, points = rng.uniform(-3, 3, (10, 3)) * [1, 1, 0.3], rng.uniform([-3, -3, 7], [3, 3, 13], (150, 3))
+    centers[1] = centers[0]
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
+    seen = points[None] - centers[:, None]
+    pixels = 600 * seen[..., :2] / seen[..., 2:] + [320, 240]
+    for number, center in enumerate(centers + 0.05 * rng.normal(size=centers.shape), start=1):
+        image = pycolmap.Image(name=f"{number}", camera_id=1, image_id=number, keypoints=pixels[number - 1])
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), -center))
+    for row, point in enumerate(points + 0.05 * rng.normal(size=points.shape)):
+        track = [pycolmap.TrackElement(number, row) for number in range(1, len(centers) + 1)]
+        model.add_point3D(point, pycolmap.Track(track))
+    work = object.__new__(module._Work)
+    work.cameras, work.camera_ids, work.known = [camera], [1], {0}
+    work._refine(model)
+    ours = np.stack([model.image(number).projection_center() for number in range(1, len(centers) + 1)])
+    found = pycolmap.estimate_sim3d(ours, centers)
+    assert found is not None
+    assert np.linalg.norm(found * ours - centers, axis=1).max() < 1e-6
 
 
 @pytest.mark.slow
@@ -203,7 +306,7 @@ def test_cameras_are_shared_by_folder_size_and_tags(tmp_path: Path) -> None:
     for number, width in enumerate((60, 70, 80, 80)):
         write(f"c/{number}.jpg", (width, 48))
     found, _ = gather([tmp_path], tmp_path / "PLACE/reconstruction/images")
-    numbers, cameras = initial_cameras(found, None)
+    numbers, cameras = initial_cameras(found, {})
     assert numbers == [0, 0, 1, 2, 2, 3, 4, 5, 6]
     assert cameras[0].mean_focal_length() == pytest.approx(28 * 80 / np.hypot(36, 24))
     assert cameras[0].has_prior_focal_length

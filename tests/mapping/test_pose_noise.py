@@ -44,3 +44,15 @@ def test_noise_is_measured_beside_wrong_matches() -> None:
     for shifted, most_deg in ((0.0, 0.45), (0.2, 0.6)):
         found = [survey(seed, shifted, turn_deg=0.3).noise(1.0) for seed in range(4)]
         assert 0.2 < np.median([noise.rotation_deg for noise in found]) < most_deg
+
+
+def test_two_cameras_that_almost_have_one_center() -> None:
+    """Those of a rig whose poses were found one by one; noise of matches made points within micrometers."""
+    pairs, along = [], np.array([0.8, 0.5, 0.33])
+    for seed in range(9):
+        rng = np.random.default_rng(seed)
+        points = rng.uniform((-3, -2, 12), (3, 2, 13.5), (100, 3))
+        shifted = points + 0.1 * along * rng.normal(size=(100, 1))
+        pairs.append(VerifiedPair(0, 1, geometry.unit(points), geometry.unit(shifted), np.eye(4)))
+    poses = np.stack([np.eye(4), geometry.make_pose(np.eye(3), 1e-7 * along)])
+    assert SurveyedPairs(pairs, poses).noise(1.0).position < 0.02

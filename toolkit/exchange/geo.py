@@ -6,7 +6,7 @@ Only for maps with an origin, see `georeference.origin_of`. Altitudes are those 
 import json
 import math
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import pandas as pd
@@ -96,14 +96,17 @@ def export_geo(run: str | Path, out: str | Path, capture: str | Path | None = No
     return sum(feature["geometry"] is not None for feature in features)
 
 
-def export_exif(run: str | Path, out: str | Path, capture: str | Path | None = None, unsure: bool = False) -> int:
+def export_exif(
+    run: str | Path, out: str | Path, capture: str | Path | None = None, unsure: bool = False, xmp: bool = False
+) -> int:  # fmt: skip
     """Write copies of the query pictures with position and direction in EXIF; the pixels of JPEGs stay byte for byte.
 
-    Of a picture that was localized in several maps, the pose with the most inliers is taken; with `unsure`, also one of
-    low confidence. Times and other tags stay. Return the number of pictures.
+    With `xmp`, write XMP files with these tags instead, `a.xmp` of `a.jpg`, to lie beside the pictures. Of a picture
+    that was localized in several maps, the pose with the most inliers is taken; with `unsure`, also one of low
+    confidence. Times and other tags stay. Return the number of pictures.
 
     Raises:
-        ManifestError: the folder `out` contains files.
+        ManifestError: the folder `out` contains files; or two XMP files would have one name.
         ImageError: a picture cannot be read; and as for `geo_table`.
     """
     out = Path(out)
@@ -119,10 +122,17 @@ def export_exif(run: str | Path, out: str | Path, capture: str | Path | None = N
     names = table["image"].map(own_name)
     if names.duplicated().any():  # of several sessions or scenes
         names = table["scene"] + "/" + table["image"].map(image_name)
+    if xmp:
+        names = names.map(lambda name: PurePosixPath(name).with_suffix(".xmp").as_posix())
+        if names.duplicated().any():
+            raise ManifestError(f"xmp: two pictures would have the file {names[names.duplicated()].iloc[0]}.")
     with write_folder(out) as folder:
         for name, row in zip(names, table.to_dict("records"), strict=True):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            _write_with_gps(Path(row["path"]), folder / name, row)
+            if xmp:
+                write_text(folder / name, _xmp(row))
+            else:
+                _write_with_gps(Path(row["path"]), folder / name, row)
     return len(table)
 
 
@@ -159,6 +169,31 @@ def _write_with_gps(source: Path, target: Path, row: Mapping[Any, Any]) -> None:
         target.write_bytes(_with_exif(jpeg, content))
     except HEADER_ERRORS as error:
         raise ImageError(f"{source}: EXIF tags cannot be written ({error}).") from None
+
+
+def _xmp(row: Mapping[Any, Any]) -> str:
+    """Return XMP with the tags of position and direction (XMP Specification, part 2, "Exif schema")."""
+    latitude, longitude, altitude, heading = (row[name] for name in GEO_COLUMNS[:4])
+
+    def angle(value: float, letters: str) -> str:
+        degrees, minutes = divmod(round(abs(value) * 60, 8), 60)
+        return f"{degrees:.0f},{minutes:.8f}{letters[value < 0]}"
+
+    tags = {
+        "GPSVersionID": "2.3.0.0", "GPSLatitude": angle(latitude, "NS"), "GPSLongitude": angle(longitude, "EW"),
+        "GPSAltitudeRef": int(altitude < 0), "GPSAltitude": f"{round(abs(altitude) * 1000)}/1000",
+        "GPSMapDatum": "WGS-84",
+    }  # fmt: skip
+    if math.isfinite(heading):
+        tags |= {"GPSImgDirectionRef": "T", "GPSImgDirection": f"{round(heading * 100) % 36000}/100"}
+    if math.isfinite(row["position_std_m"]):
+        tags["GPSHPositioningError"] = f"{round(row['position_std_m'] * 10000)}/10000"
+    lines = "".join(f'\n   exif:{name}="{value}"' for name, value in tags.items())
+    return (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/">\n <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">\n'
+        f'  <rdf:Description rdf:about="" xmlns:exif="http://ns.adobe.com/exif/1.0/"{lines}/>\n'
+        " </rdf:RDF>\n</x:xmpmeta>\n"
+    )
 
 
 def _with_exif(jpeg: bytes, exif: bytes) -> bytes:

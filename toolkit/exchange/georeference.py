@@ -9,6 +9,7 @@ import numpy as np
 import PIL.Image
 import pycolmap
 
+from toolkit.alignment.similarity import align_to_map
 from toolkit.capture import Session
 from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.images import HEADER_ERRORS, ORIENTATION, read_number
@@ -32,6 +33,9 @@ _EARTH_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84
 _SQUARE = _FLATTENING * (2 - _FLATTENING)  # squared eccentricity
 _LEAST_HORIZONTAL = 1e-3  # smallest horizontal part of an optical axis that has a heading
 GPS = "GPS in EXIF"
+PRIOR = "rough poses"
+PRIOR_NOISE_M = 0.05  # expected noise of a rough position; within a small factor, the data decide
+MOST_ALIGNED = 60  # images by which a model is aligned to rough poses
 _GPS_TAGS = 0x8825  # number of the EXIF tag
 
 
@@ -42,11 +46,13 @@ class Placing:
     unit: str | None  # "m", or None if it is unknown
     record: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    prior_noise_m: float | None = None  # standard deviation of a coordinate of the rough poses that it is by
 
 
 def place(
     model: pycolmap.Reconstruction, quarter_turns: Mapping[str, int], geo: Mapping[str, tuple[float, float, float]],
     distance: tuple[str, str, float] | None = None, positions: Mapping[str, Floats] | None = None,
+    prior: Mapping[str, Floats] | None = None,
 ) -> Placing:  # fmt: skip
     """Transform a model in place: z up, and meters if they are known.
 
@@ -54,6 +60,7 @@ def place(
         quarter_turns: by the user's name of an image: counter-clockwise turns that make it upright, from EXIF.
         geo: latitude and longitude, degrees, and altitude, meters.
         distance, positions: see `reconstruct.reconstruct`.
+        prior: rough world_from_cam (4, 4) by name, in meters, whose world the model gets.
 
     Raises:
         ManifestError: a distance between points that are not known or not clear.
@@ -62,6 +69,8 @@ def place(
     up = up_of_cameras([_upright(image, quarter_turns.get(name, 0)) for name, image in images.items()])
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(_rotation_to_z(up)), np.zeros(3)))
     record: dict[str, Any] = {"up": "by the cameras"}
+    if prior:
+        return _place_by_poses(model, images, prior, record)
     if distance is not None:
         ends = [_point(model, images, text) for text in distance[:2]]
         length = float(np.linalg.norm(ends[0] - ends[1]))
@@ -96,6 +105,28 @@ def place(
         record["origin"] = dict(zip(GEO_COLUMNS[:3], origin.tolist(), strict=True))
         record["axes"] = "x east, y north, z up"
     return Placing("m", record, [f"meters: from {how}, {facts}; up: by {by}"])
+
+
+def _place_by_poses(
+    model: pycolmap.Reconstruction, images: Mapping[str, pycolmap.Image], prior: Mapping[str, Floats],
+    record: dict[str, Any],
+) -> Placing:  # fmt: skip
+    """Transform a model to the world of rough poses; orientations tell up, also where positions are on a line."""
+    names = sorted(name for name in images if name in prior)
+    names = names[:: -(-len(names) // MOST_ALIGNED) or 1]
+    if not names:
+        return Placing(None, record, [f"{PRIOR}: none of a photograph in the model"])
+    ours = np.stack([_upright(images[name], 0) for name in names])
+    found = align_to_map(ours, np.stack([prior[name] for name in names]), center_noise_m=PRIOR_NOISE_M)
+    facts = f"{found.num_inliers} of {len(names)} photographs, residual {found.rmse_m:.2g} m, "
+    facts += f"scale known to {100 * found.scale_std:.1g} %"
+    if not found.scale_std <= MAX_SCALE_DEVIATION:
+        return Placing(None, record, [f"{PRIOR}: of no use for the scale ({facts}; {found.reason})"])
+    by = found.world_from_model
+    model.transform(pycolmap.Sim3d(by.scale, pycolmap.Rotation3d(by.rotation), by.translation))
+    record |= {"meters": PRIOR, "residual_m": found.rmse_m, "scale deviation": found.scale_std, "up": f"by {PRIOR}"}
+    note = f"meters and world: from {PRIOR}, {facts}"
+    return Placing("m", record, [note], found.center_noise_m / np.sqrt(3))
 
 
 def alignment(
@@ -139,7 +170,8 @@ def fit(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, Floats, float, 
         a, b = source[inliers], target[inliers]
         new_from_old = pycolmap.estimate_sim3d(a, b) or new_from_old
     errors = np.linalg.norm(new_from_old * a - b, axis=1)
-    spread = np.linalg.svd(b - b.mean(axis=0), compute_uv=False)
+    # Of the model: noise spreads the known positions, which would then state a scale surer than it is.
+    spread = new_from_old.scale * np.linalg.svd(a - a.mean(axis=0), compute_uv=False)
     sigma = np.sqrt((errors**2).sum() / max(3 * len(a) - 7, 1))
     level = bool(np.degrees(sigma / max(spread[1], 1e-9)) < MAX_TILT_DEG)
     if not level:  # rotate about z only

@@ -51,7 +51,7 @@ def add_recording(
     names = {item.name for item in old.values()}
     if not new or any(item.name in names for item in new):
         raise CaptureError(f"{sources[0]}: its photographs, or others of these names, are in {session} already.")
-    work = _Work(folder, device, [*old.values(), *new], None)
+    work = _Work(folder, device, [*old.values(), *new], {})
     _keep_cameras(work, base, {item.name: number for number, item in old.items()})
     work.extract(LocalMethod("sift", SiftExtractor(), _Mutual(RATIO, shorten=KINDS["sift"].shorten)), range(len(work)))
     fixed = set(base.reg_image_ids())
@@ -112,7 +112,10 @@ def _model(folder: Path, session: Path) -> pycolmap.Reconstruction:
     path = folder / "models" / "0"
     if not (session / RECORD).is_file() or not path.is_dir():
         raise CaptureError(f"{session} exists, but was not reconstructed here, so nothing can be added to its model.")
-    return pycolmap.Reconstruction(str(path))
+    model = pycolmap.Reconstruction(str(path))
+    if any(rig.num_sensors() > 1 for rig in model.rigs.values()):
+        raise CaptureError(f"{session} has rigs, so it does not grow. Reconstruct all its photographs with --replace.")
+    return model
 
 
 def _photographs(base: pycolmap.Reconstruction, folder: Path, session: Path) -> dict[int, Photograph]:
@@ -130,7 +133,7 @@ def _photographs(base: pycolmap.Reconstruction, folder: Path, session: Path) -> 
 def _keep_cameras(work: _Work, base: pycolmap.Reconstruction, number_of: dict[str, int]) -> None:
     """Give images of the model their numbers and cameras; start those of equal size and EXIF at the same intrinsics."""
     fresh = [item for item in work.photographs if item.name not in number_of]
-    camera_of, cameras = initial_cameras(fresh, None)
+    camera_of, cameras = initial_cameras(fresh, {})
     keys = {}
     for item in work.photographs:
         if item.name in number_of:

@@ -378,6 +378,19 @@ def read_poses(table: Path, poses_are: str) -> tuple[list[str], dict[str, Floats
     return list(rows["image"]), _poses_of(rows, poses_are)
 
 
+def read_intrinsics(table: Path) -> dict[str, pycolmap.Camera]:
+    """Return the cameras of the images in a table with the columns model, width, height, params, or in hloc's list."""
+    rows = _read_table(table)
+    if "model" not in rows:
+        raise CaptureError(f"{table}: no intrinsics in it. Expected the columns image, {', '.join(_CAMERA_COLUMNS)}.")
+    found = {}
+    for row in rows.to_dict("records"):
+        camera, _ = _camera_of(row, {}, None, table, f"{table}, line {row['line']}")
+        assert isinstance(camera, pycolmap.Camera)
+        found[str(row["image"])] = camera
+    return found
+
+
 def _read_table(path: Path) -> pd.DataFrame:
     """Read the table of a folder of images, all values as text, with the additional column `line`; with poses, also
     column `problem`, why the pose of a row is none.

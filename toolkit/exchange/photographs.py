@@ -12,6 +12,7 @@ import pycolmap
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from toolkit.capture.cameras import camera_text
 from toolkit.capture.images import HEADER_ERRORS, exif_camera, exif_key, find_mask, read_header
 from toolkit.errors import CaptureError, ImageError
 from toolkit.exchange.drafts import (
@@ -185,25 +186,35 @@ def _motion(before: NDArray[np.uint8], now: NDArray[np.uint8]) -> float:
 
 
 def initial_cameras(
-    photographs: Iterable[Photograph], given: pycolmap.Camera | None
+    photographs: Iterable[Photograph], known: Mapping[str, pycolmap.Camera], rigs: Sequence[Sequence[str]] = ()
 ) -> tuple[list[int], list[pycolmap.Camera]]:
     """Return for each photograph the number of its camera, and the cameras before they are estimated.
 
-    Photographs of one folder with one size, make, model and focal length in EXIF share a camera. Without these tags,
-    they do so only if all in the folder have one size, as those that a person collected have several.
+    Photographs with equal `known` intrinsics, by name, share a camera; of the others, those of one folder with one
+    size, make, model and focal length in EXIF. Without these tags, they do so only if all in the folder have one size,
+    as those that a person collected have several. Those whose names begin with one of the prefixes of `rigs` share one.
+
+    Raises:
+        CaptureError: the photographs of a camera of a rig have several sizes or known intrinsics.
     """
     photographs = list(photographs)
     sizes = [read_header(item.path)[0] for item in photographs]
     folders = [Path(item.name).parent for item in photographs]
     different = Counter(folder for folder, _ in {*zip(folders, sizes, strict=True)})
-    keys: dict[Any, int] = {}
+    keys, of_prefix = dict[Any, int](), dict[str, Any]()
     numbers, cameras = list[int](), list[pycolmap.Camera]()
     for index, (item, size, folder) in enumerate(zip(photographs, sizes, folders, strict=True)):
         tags = exif_key(item.exif)
-        key = folder, size, tags, index if different[folder] > 2 and not any(tags) else None
+        given = known.get(item.name)
+        alone = index if different[folder] > 2 and not any(tags) else None
+        key = (folder, size, tags, alone) if given is None else camera_text(given)
+        if prefix := next((one for rig in rigs for one in rig if item.name.startswith(one)), None):
+            if of_prefix.setdefault(prefix, (size, given and key)) != (size, given and key):
+                raise CaptureError(f"rig: photographs in {prefix} have several cameras, as {item.name}; expected one.")
+            key = prefix
         if key not in keys:
             keys[key] = len(cameras)
-            cameras.append(given if given is not None else _initial(item.path, size))
+            cameras.append(_initial(item.path, size) if given is None else pycolmap.Camera(given.todict()))
         numbers.append(keys[key])
     return numbers, cameras
 

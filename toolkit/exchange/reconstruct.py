@@ -8,13 +8,13 @@ database, and all models in COLMAP's format. The capture gets the largest model.
 import json
 import logging
 import shutil
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pycolmap
@@ -27,11 +27,12 @@ from toolkit.capture.images import default_workers, prefetch
 from toolkit.embedders.vlad import Vlad
 from toolkit.errors import CaptureError, ManifestError, WeightsError
 from toolkit.exchange.colmap_model import inverse
-from toolkit.exchange.drafts import SUBSESSION, Draft, DraftImage, every_nth, list_images, start
+from toolkit.exchange.drafts import AXES, SUBSESSION, Draft, DraftImage, every_nth, list_images, start
 from toolkit.exchange.georeference import RECORD, place, read_positions
 from toolkit.exchange.import_report import ImportReport
-from toolkit.exchange.interchange import once
+from toolkit.exchange.interchange import once, read_intrinsics, read_poses
 from toolkit.exchange.photographs import TAKEN_SUFFIXES, Photograph, gather, initial_cameras
+from toolkit.exchange.rigs import Prefixes, join, read_rigs
 from toolkit.features.features import KINDS, LocalFeatures
 from toolkit.features.matching import (
     LocalMethod,
@@ -52,6 +53,7 @@ from toolkit.store.items import Items, heals
 from toolkit.threads import one_thread
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 FOLDER = "reconstruction"
 UNIT_HINT = "If you know a length, give --distance or --positions, or photographs with GPS"
@@ -65,6 +67,8 @@ LOSS_PX, MAX_ERROR_PX, MIN_ANGLE_DEG = 0.5, 4.0, 1.5
 """Of the last bundle adjustment: scale of the Cauchy loss and largest error of an observation, in pixels of the image
 where features are detected, and smallest triangulation angle."""
 FEW_PAIRS, STRONGEST = 100, 2048  # if there are more pairs, only so many SIFT features of each photograph are matched
+MAPPED_NOISE_M = 0.2  # of the positions of rough poses in COLMAP's mapper, whose loss is robust; drift adds to noise
+MAX_VIEW_DEG = 60.0  # largest angle between the optical axes of images that are neighbors by rough poses
 MIN_POINTS = 30  # points of a photograph in a model; COLMAP requires as many when it estimates a pose
 _BATCH = 64  # pairs that are matched at once
 
@@ -99,9 +103,14 @@ class _Mutual(MutualMatcher):
 class _Work:
     """Photographs with features and verified matches, in the folder of the reconstruction."""
 
-    def __init__(self, folder: Path, device: str, photographs: list[Photograph], given: pycolmap.Camera | None) -> None:
-        self.folder, self.photographs, self.fixed = folder, photographs, given is not None
-        self.camera_of, self.cameras = initial_cameras(photographs, given)
+    def __init__(
+        self, folder: Path, device: str, photographs: list[Photograph], known: Mapping[str, pycolmap.Camera],
+        prior: Mapping[str, Floats] | None = None, rigs: Prefixes | None = None,
+    ) -> None:  # fmt: skip
+        self.folder, self.photographs, self.rigs = folder, photographs, rigs or []
+        self.camera_of, self.cameras = initial_cameras(photographs, known, self.rigs)
+        self.known = {number for number, item in zip(self.camera_of, photographs, strict=True) if item.name in known}
+        """Numbers of the cameras whose intrinsics stay as they are."""
         session = folder / "sessions" / f"{device}_map"
         shutil.rmtree(session, ignore_errors=True)
         draft = Draft(session, folder, sources={item.name: item.path for item in photographs})
@@ -121,6 +130,8 @@ class _Work:
         """Names of the images in the stores, in the order of the photographs."""
         self.photographs = [photographs[self.photograph_of[row]] for row in order]
         self.camera_of = [self.camera_of[self.photograph_of[row]] for row in order]
+        self.prior = np.stack([(prior or {}).get(item.name, np.full((4, 4), np.nan)) for item in self.photographs])
+        """Rough world_from_cam (N, 4, 4), meters; NaN where there is none."""
         self.kinds: list[tuple[LocalMethod, FeatureStore]] = []
         self.pairs: list[dict[tuple[int, int], Ints]] = []
         """For each kind, the verified matches (K, 2) of pairs of images."""
@@ -178,7 +189,27 @@ class _Work:
         pairs = {(i, j) for i, others in enumerate(near) for j in others if folders[i] == folders[j]}
         for i, similar in enumerate(np.argsort(-self.similarity, axis=1, kind="stable")[:, :SIMILAR].tolist()):
             pairs |= {(min(i, j), max(i, j)) for j in similar}
+        for i, apart in enumerate(self._apart_by_prior()):
+            pairs |= {(min(i, j), max(i, j)) for j in np.argsort(apart, kind="stable")[:SIMILAR] if apart[j] < np.inf}
         return sorted(pairs)
+
+    def _apart_by_prior(self) -> Floats:
+        """(N, N) distances, meters, of images that look into similar directions by rough poses; else inf."""
+        centers, axes = self.prior[:, :3, 3], self.prior[:, :3, 2]
+        apart = np.linalg.norm(centers[:, None] - centers, axis=2)
+        apart[~(axes @ axes.T > np.cos(np.radians(MAX_VIEW_DEG)))] = np.inf  # NaN, too
+        np.fill_diagonal(apart, np.inf)
+        return apart
+
+    def hold_to_prior(self, model: pycolmap.Reconstruction, noise_m: float) -> None:
+        """Adjust a model, in the world of rough poses, to their positions, too, which have this standard deviation."""
+        options, config = self._adjustment(), self._of_model(model)
+        found = pycolmap.PosePriorBundleAdjustmentOptions()
+        found.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        registered = set(model.reg_image_ids())
+        priors = [prior for prior in self._position_priors(noise_m) if prior.pose_prior_id in registered]
+        with _quiet():
+            pycolmap.create_pose_prior_bundle_adjuster(options, found, config, priors, model).solve()
 
     def match(self, kind: int, pairs: Sequence[tuple[int, int]]) -> None:
         """Match pairs and keep the matches that agree with one relative pose of their cameras."""
@@ -204,6 +235,19 @@ class _Work:
                 self.matched[pair] = max(count, self.matched.get(pair, 0))
                 if len(inliers) >= MIN_INLIERS:
                     self.pairs[kind][pair] = inliers
+
+    def _position_priors(self, noise_m: float) -> list[pycolmap.PosePrior]:
+        """Return the positions of rough poses, with the number of the image as that of the prior."""
+        priors = []
+        for image in np.flatnonzero(np.isfinite(self.prior).all(axis=(1, 2))).tolist():
+            number, camera_id = self.image_ids[image], self.camera_ids[self.camera_of[image]]
+            prior = pycolmap.PosePrior(
+                position=self.prior[image, :3, 3], position_covariance=noise_m**2 * np.eye(3)
+            )
+            prior.pose_prior_id, prior.coordinate_system = number, pycolmap.PosePriorCoordinateSystem.CARTESIAN
+            prior.corr_data_id = pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id), number)
+            priors.append(prior)
+        return priors
 
     def inliers(self) -> Ints:
         """(N, N) numbers of verified matches."""
@@ -235,6 +279,8 @@ class _Work:
                 offsets[1:, image] = np.cumsum([len(part) for part in keypoints])
                 points = self.in_model.get(number, np.concatenate(keypoints))
                 database.write_keypoints(number, points.astype(np.float32))
+            for prior in self._position_priors(MAPPED_NOISE_M):
+                database.write_pose_prior(prior, True)
             both: dict[tuple[int, int], list[Ints]] = {}
             for kind, found in enumerate(self.pairs):
                 for pair, indices in found.items():
@@ -269,6 +315,9 @@ class _Work:
             kept = ordered[:1] + [model for model in ordered[1:] if not {*model.reg_image_ids()} <= inside]
             for model in tqdm(kept, "refine", unit="model"):
                 self._refine(model)
+            if self.rigs and kept:
+                join(kept[0], database, self.rigs, self.names[0].removesuffix(self.photographs[0].name))
+                self._refine(kept[0])
         return [model for model in kept if model.num_reg_images() >= MIN_MODEL]
 
     def _incremental_options(self) -> pycolmap.IncrementalPipelineOptions:
@@ -279,7 +328,9 @@ class _Work:
         options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
         options.ba_global_function_tolerance = options.ba_local_function_tolerance = 1e-4
         options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
-        if self.fixed:
+        if np.isfinite(self.prior).any():
+            options.use_prior_position = options.use_robust_loss_on_prior_position = True
+        if len(self.known) == len(self.cameras):  # else `_refine` restores them: COLMAP's `constant_cameras` move
             options.ba_refine_focal_length = options.ba_refine_extra_params = False
             options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
         return options
@@ -289,27 +340,46 @@ class _Work:
 
         Images `fixed`, by their ids, keep their poses and cameras.
         """
-        longest = max(max(camera.width, camera.height) for camera in self.cameras)
-        scale = max(1.0, longest / SiftSettings().max_long_side)
-        options = pycolmap.BundleAdjustmentOptions(print_summary=False, min_track_length=2)
-        options.refine_focal_length = options.refine_extra_params = not self.fixed
-        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        options.ceres.loss_function_scale = LOSS_PX * scale
-        options.ceres.solver_options.max_num_iterations = 50
+        scale = self._image_scale
+        for number in self.known:
+            if (camera_id := self.camera_ids[number]) in model.cameras:
+                model.cameras[camera_id].params = self.cameras[number].params.tolist()
         for _ in range(2):
-            config = pycolmap.BundleAdjustmentConfig()
-            for number in model.reg_image_ids():
-                config.add_image(number)
-            for image in (model.image(number) for number in fixed):
-                config.set_constant_rig_from_world_pose(image.frame_id)
-                config.set_constant_cam_intrinsics(image.camera_id)
-            if not fixed:
-                config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-            pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+            pycolmap.create_default_bundle_adjuster(self._adjustment(), self._of_model(model, fixed), model).solve()
             pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX * scale, MIN_ANGLE_DEG)
-            for image in list(model.images.values()):  # a wrong pose keeps few points
-                if image.has_pose and image.num_points3D < MIN_POINTS and image.image_id not in fixed:
-                    model.deregister_frame(image.frame_id)
+            for frame in list(model.frames.values()):  # a wrong pose keeps few points
+                images = [model.image(data.id) for data in frame.image_ids]
+                few = sum(image.num_points3D for image in images) < MIN_POINTS
+                if frame.has_pose and few and not any(image.image_id in fixed for image in images):
+                    model.deregister_frame(frame.frame_id)
+
+    @property
+    def _image_scale(self) -> float:
+        """Size of the largest image over that where features are detected."""
+        return max(1.0, max(max(camera.width, camera.height) for camera in self.cameras) / SiftSettings().max_long_side)
+
+    def _adjustment(self) -> pycolmap.BundleAdjustmentOptions:
+        options = pycolmap.BundleAdjustmentOptions(print_summary=False, min_track_length=2)
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.loss_function_scale = LOSS_PX * self._image_scale
+        options.ceres.solver_options.max_num_iterations = 50
+        options.ceres.solver_options.function_tolerance = 1e-6
+        return options
+
+    def _of_model(self, model: pycolmap.Reconstruction, fixed: Collection[int] = ()) -> pycolmap.BundleAdjustmentConfig:
+        """Return what is adjusted: all of a model but poses and cameras of images `fixed`, and known cameras.
+
+        The gauge is free: fixed by two cameras that are those of a rig with one center, it bends the model (STRECHA).
+        """
+        config = pycolmap.BundleAdjustmentConfig()
+        for number in model.reg_image_ids():
+            config.add_image(number)
+        for number in fixed:
+            config.set_constant_rig_from_world_pose(model.image(number).frame_id)
+        kept = {self.camera_ids[number] for number in self.known} | {model.image(number).camera_id for number in fixed}
+        for camera_id in kept & {model.image(number).camera_id for number in model.reg_image_ids()}:
+            config.set_constant_cam_intrinsics(camera_id)
+        return config
 
 
 @contextmanager
@@ -327,7 +397,8 @@ def _quiet() -> Iterator[None]:
 def reconstruct(
     sources: Sequence[str | Path], capture: str | Path, device: str = "ios", fps: float | None = None,
     camera: str | None = None, distance: tuple[str, str, float] | None = None, mapper: str = "incremental",
-    **options: Any,
+    table: str | Path | None = None, poses_prior: str | Path | None = None,
+    rig: str | Path | None = None, **options: Any,
 ) -> Reconstruction:  # fmt: skip
     """Make a map session from photographs without poses, and with `hold_out` a query session with ground truth.
 
@@ -338,9 +409,16 @@ def reconstruct(
         fps: frames per second of videos; None: chosen by motion.
         camera: intrinsics of all photographs, `MODEL, width, height, parameter, ...`, kept as they are; None:
             estimated, from EXIF if it has a focal length.
+        table: intrinsics of photographs, see `interchange.read_intrinsics`, kept as they are; those that are not in it
+            have those of `camera`.
+        poses_prior: rough poses of photographs, a table as of `interchange.read_poses` in meters: world_from_cam of a
+            device's tracking, with the camera axes of the option `axes`. They tell which photographs are neighbors,
+            and the world of the model.
         distance: two points, `IMAGE:x,y` in pixels, or images for the centers of their cameras, and the meters
             between.
         mapper: COLMAP's `incremental` or `global` mapper.
+        rig: `folders` if the folders are the cameras of one rig, whose photographs with equal names were taken at the
+            same time, or COLMAP's rig_config.json, see `rigs.read_rigs`; each folder is one camera then.
         options: see `drafts.Options`; GPS in EXIF is used in any case.
 
     Raises:
@@ -351,6 +429,9 @@ def reconstruct(
         raise ManifestError(f"mapper: found {mapper!r}, expected incremental or global.")
     folder = Path(capture) / FOLDER
     positions, masks = options.pop("positions", None), options.pop("masks", None)
+    axes = options.pop("axes", "opencv")
+    if poses_prior is not None and (distance is not None or positions is not None):
+        raise ManifestError("poses-prior: found together with distance or positions. Give one of them.")
     draft = start(capture, device, "map", folder, **options)
     masks = None if masks is None else Path(masks)
     photographs, unreadable = gather(list(map(Path, sources)), folder / "images", fps, masks)
@@ -363,7 +444,14 @@ def reconstruct(
             raise ManifestError(f"camera: {error}") from None
     if not photographs:
         raise CaptureError(f"{sources[0]}: no photograph can be read. First: {next(iter(unreadable.items()))}")
-    work = _Work(folder, device, photographs, given)
+    cameras = dict.fromkeys((item.name for item in photographs), given) if given is not None else {}
+    cameras |= _of_photographs(read_intrinsics(Path(table)), photographs, table) if table is not None else {}
+    prior = read_poses(Path(poses_prior), "world_from_cam")[1] if poses_prior is not None else {}
+    prior = {name: pose @ AXES[axes] for name, pose in prior.items()}
+    prior = _of_photographs(prior, photographs, poses_prior) if prior else prior
+    rigs = read_rigs(rig, photographs) if rig is not None else []
+    work = _Work(folder, device, photographs, cameras, prior, rigs)
+    draft.frames_are_names = not rigs
     held = every_nth([item.name for item in work.photographs], draft.hold_out)
     work.unusable |= unreadable
     matcher = _Mutual(RATIO, shorten=KINDS["sift"].shorten)
@@ -380,7 +468,9 @@ def reconstruct(
         raise CaptureError(f"{sources[0]}: no two of {len(work)} photographs fit together. {worst}.")
     model = models[0]
     geo = {item.name: item.geo for item in work.photographs if item.geo is not None}
-    placed = place(model, {item.name: item.quarter_turns for item in work.photographs}, geo, distance, known)
+    placed = place(model, {item.name: item.quarter_turns for item in work.photographs}, geo, distance, known, prior)
+    if placed.prior_noise_m is not None and not rigs:  # COLMAP's position priors are of single cameras
+        work.hold_to_prior(model, placed.prior_noise_m)
     paths = [folder / "models" / str(number) for number in range(len(models))]
     shutil.rmtree(folder / "models")
     for path, each in zip(paths, models, strict=True):
@@ -392,7 +482,7 @@ def reconstruct(
         if name in images:
             image, known_focal = images[name], work.cameras[number].has_prior_focal_length
             origin = f"estimated, started at {'EXIF' if known_focal else f'{FOCAL_PRIOR} times the longer side'}"
-            origin = "given by --camera" if given is not None else origin
+            origin = f"given by {'--camera' if table is None else '--table'}" if number in work.known else origin
             add_posed(draft, item, image, sensors[image.camera_id], origin)
     draft.rows += [{"image": name, "status": reason} for name, reason in _reasons(work, models).items()]
     sizes, error_px = [each.num_reg_images() for each in models], model.compute_mean_reprojection_error()
@@ -409,7 +499,7 @@ def reconstruct(
         where = ", ".join(f"{size} in {path}" for size, path in zip(sizes[1:], paths[1:], strict=True))
         draft.notes.append(f"not connected to it, so not used: models of {where}")
     draft.notes += placed.notes
-    report = draft.finish({name for name in held if name in draft.poses})
+    report = draft.finish(None if rigs else {name for name in held if name in draft.poses})
     for one in filter(None, (report, report.held_out)):
         write_text(one.session / RECORD, json.dumps(record, indent=1) + "\n")
         _hand_over(work, one.session)
@@ -419,12 +509,30 @@ def reconstruct(
     return Reconstruction(report, xyz.reshape(-1, 3), rgb.reshape(-1, 3), option)
 
 
+def _of_photographs(found: dict[str, T], photographs: Sequence[Photograph], table: object) -> dict[str, T]:
+    """Return what a table says of photographs, by their names; those that were converted have `.png` added."""
+    names = {name: item.name for item in photographs for name in (item.name.removesuffix(".png"), item.name)}
+    kept = {names[name]: value for name, value in found.items() if name in names}
+    if not kept:
+        first = f"found {next(iter(found), 'no image')!r}, expected {photographs[0].name!r}"
+        raise CaptureError(f"{table}: none of the photographs is in it: {first} and others.")
+    return kept
+
+
 def add_posed(draft: Draft, item: Photograph, image: pycolmap.Image, sensor: str, origin: str) -> None:
     """Add a photograph with its camera and pose in a model to a session."""
     draft.convention, draft.unit_hint = "found by structure from motion", UNIT_HINT
     assert image.camera is not None
-    draft.images.append(DraftImage(item.name, image.camera, sensor, item.name, origin=origin))
-    draft.poses[item.name] = inverse(image.cam_from_world())
+    frame = image.frame
+    assert frame is not None
+    assert frame.rig is not None
+    assert frame.rig_from_world is not None
+    in_rig = frame.rig.num_sensors() > 1
+    key, rig = (f"{frame.frame_id}", f"{SUBSESSION}/rig_{frame.rig_id}") if in_rig else (item.name, None)
+    draft.images.append(DraftImage(item.name, image.camera, sensor, key, rig, origin))
+    draft.poses[key] = inverse(frame.rig_from_world)
+    if rig is not None and all(row[:2] != (rig, sensor) for row in draft.rigs):
+        draft.rigs.append((rig, sensor, inverse(image.cam_from_world() * frame.rig_from_world.inverse())))
     draft.sources[item.name] = item.path
     if item.mask is not None:
         draft.mask_files[item.name] = item.mask

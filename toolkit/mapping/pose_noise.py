@@ -20,6 +20,7 @@ MAX_MATCHES = 200  # of a pair that are used
 MIN_PAIRS = 6  # for an estimate
 INDEPENDENT = 20.0  # number of independent matches of a pair, as errors of neighbors are alike
 MIN_PARALLAX_DEG = 0.3  # of a match that tells the depth of its point; others count as infinitely far
+NEAREST = 0.01  # map lengths; no point is nearer
 MIN_ERROR = 2e-4  # radians; least scale of the errors of matches
 SAME_SCALE = 2.0  # factor on the scale of the errors below which most matches agree with the poses as they are
 FREEDOM = 5.0  # degrees of freedom of Student's distribution, in which a few pairs may be wrong
@@ -150,7 +151,8 @@ class SurveyedPairs:
         along = (first * baselines).sum(axis=1), (second * baselines).sum(axis=1)
         depth_i, depth_j = (cosine * along[1] - along[0]) / sine2, (along[1] - cosine * along[0]) / sine2
         far = np.degrees(np.arctan2(np.linalg.norm(np.cross(first, second), axis=1), cosine)) <= MIN_PARALLAX_DEG
-        near = ~far & (depth_i > 0) & (depth_j > 0)
+        # Of cameras with one center, as of a rig, noise alone makes points, within millimeters.
+        near = ~far & (np.minimum(depth_i, depth_j) > NEAREST * length)
         ratio = np.where(near, depth_i / np.where(near, depth_j, 1.0), 1.0)
         nearness = np.where(near, length / np.where(near, depth_j, 1.0), 0.0)
         derivatives = np.column_stack([ratio[:, None] * np.cross(first, normals), normals * nearness[:, None]])
