@@ -16,7 +16,7 @@ from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.devices import in_order
 from toolkit.errors import ArtifactError, CaptureError, ToolkitError
 from toolkit.figures.evaluation import Evaluation, draw_evaluation
-from toolkit.figures.sequences import SequencePair
+from toolkit.figures.sequences import SequencePair, warn_of_older
 from toolkit.figures.style import save_figure
 from toolkit.files import (
     map_record_path,
@@ -215,6 +215,7 @@ def evaluate_sequences(
         or ground truth.
     """
     steps, changes = [pd.DataFrame()], [pd.DataFrame()]
+    warn_of_older(poses_dir)
     for map_, query in _chosen((map_devices, query_devices), pairs):
         sequence = SequencePair.find(poses_dir, capture.name, map_, query)
         if sequence is None:

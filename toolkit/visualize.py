@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, DamagedError
 from toolkit.figures.query_images import WorstQuery, draw_localization, draw_worst
-from toolkit.figures.sequences import SequencePair, draw_sequence
+from toolkit.figures.sequences import SequencePair, draw_sequence, warn_of_older
 from toolkit.figures.style import save_figure
 from toolkit.figures.top_view import draw_scene
 from toolkit.files import pair_name, require_current, sidecar_path, write_sidecar
@@ -84,6 +84,7 @@ def visualize_scene(
     sheet = out / f"worst_{capture.name}.png"
     for path in (sheet, sidecar_path(sheet)):
         path.unlink(missing_ok=True)
+    warn_of_older(poses_dir)
     for m, q in tqdm(chosen, desc="visualize", unit="pair"):
         name = pair_name(capture.name, m, q)
         _remove_images(out, name)  # those of an earlier run would look like results of this one
