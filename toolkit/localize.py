@@ -16,7 +16,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
-from toolkit.capture.tables import in_unit_of_poses, read_query_table
+from toolkit.capture.tables import POSES_UNIT, in_unit_of_poses, read_query_table
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import ToolkitError, reason_of
 from toolkit.features.matching import AnyMethod, MutualMatcher, resolve_auto, weights_files
@@ -527,7 +527,8 @@ def _write_poses(path: Path, rows: Sequence[dict[str, Any]], settings: LocalizeS
     columns = [*COLUMNS, *(PREDICTION_COLUMNS if settings.predicts else [])]
     columns += FALLBACK_COLUMNS if settings.features.escalation else []
     with write_atomic(path.with_suffix(".csv")) as temporary:
-        in_unit_of_poses(pd.DataFrame(rows, columns=columns), settings.unit).to_csv(temporary, index=False)
+        table = pd.DataFrame(rows).rename(columns=POSES_UNIT).reindex(columns=columns)
+        in_unit_of_poses(table, settings.unit).to_csv(temporary, index=False)
     posed = [row for row in rows if np.isfinite(row["world_from_rig"]).all()]
     covariances = np.array([row["covariance"] for row in posed]).reshape(-1, 6, 6)
     Trajectory.from_poses(

@@ -204,11 +204,10 @@ def _draw_worst(path: Path, scene: str, candidates: pd.DataFrame) -> None:
     """Draw the worst queries of all pairs; `candidates` are the rows of `_draw_pair`."""
     shown = []
     for _, row in named_as_meters(candidates.iloc[worst_first(candidates)[:WORST]]).iterrows():
-        has_matches, reason = row["details"].has_matches, [textwrap.shorten(row["status"], 72, placeholder=" …")]
-        if has_matches and pd.notna(row.get("num_matches")):
+        reason = [textwrap.shorten(row["status"], 72, placeholder=" …")]
+        if row["details"].has_matches and pd.notna(row.get("num_matches")):
             reason.append(f"{row['num_matches']:.0f} matches")
-        if has_matches or row.get("num_inliers", 0) > 0:
-            reason.append(support_of(row))
+        reason += filter(None, [support_of(row)])
         errors = row["rotation_error_deg"], row["translation_error_m"]
         shown.append(WorstQuery(row["pair"], ", ".join(reason), row["details"], *errors, row["unit"]))
     title = f"{scene}: the {len(shown)} worst queries of all pairs"

@@ -60,14 +60,14 @@ def test_a_single_camera_shows_its_inliers_and_where_its_references_see_them(cap
     (camera,) = details.cameras
     np.testing.assert_array_equal(camera.pixels, found.pixels)
     np.testing.assert_allclose(camera.points, found.points)
-    assert camera.inlier.tolist() == INLIERS
+    assert camera.agrees.tolist() == INLIERS
     assert [image.name for image in details.references] == list(query.references)
     second = details.references[1]
     assert second.matches.tolist() == [0, 2, 4]
     np.testing.assert_array_equal(second.pixels, found.view_pixels[found.view_reference == 1])
     figure = draw_localization(details)
     rejected, _ = drawn(figure.axes[0])
-    np.testing.assert_allclose(rejected, found.pixels[~found.inlier])
+    np.testing.assert_allclose(rejected, found.pixels[~found.agrees])
     assert figure.axes[0].get_title() == "query: 4 of 6 map points agree"
     titles = [axis.get_title() for axis in figure.axes[1:]]
     assert titles == ["reference 1: sees 4 points", "reference 2: sees 2 points"]

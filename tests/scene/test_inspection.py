@@ -77,7 +77,7 @@ def test_it_shows_what_the_stage_stored(files: SceneFiles, pair: InspectedPair) 
     stored = pair.localized.results[1]
     assert one.result.status_text == row["status"]
     assert one.numbers["num_inliers"] == row["num_inliers"]
-    assert one.matches["agree"].sum() == stored.correspondences.inlier.sum() > 0
+    assert one.matches["agree"].sum() == stored.correspondences.agrees.sum() > 0
     assert one.matches.to_numpy().sum() == len(stored.correspondences)
     off = invert(one.result.world_from_rig) @ one.true_pose
     assert one.error[1] == pytest.approx(np.linalg.norm(off[:3, 3])), "of the rig"

@@ -102,7 +102,7 @@ class DepthRatios:
         """Whether the reference of each ratio is known."""
         return len(self.reference) > 0 and bool(self.reference[0] >= 0)
 
-    def estimate(self, inliers: Bools | None) -> ScaleEstimate | None:
+    def estimate(self, consistent: Bools | None) -> ScaleEstimate | None:
         """Return the scale from the samples; None without samples.
 
         Expectation maximization fits a mixture of noise around one value and uniformly distributed wrong samples. It
@@ -110,9 +110,9 @@ class DepthRatios:
         that the samples of one reference share is estimated by moments (DerSimonian and Laird 1986).
 
         Args:
-            inliers: (M,) references whose samples are used; None uses all. Ignored if the references are unknown.
+            consistent: (M,) references whose samples are used; None uses all. Ignored if the references are unknown.
         """
-        kept = inliers[self.reference] if self.grouped and inliers is not None else np.ones(len(self.log), bool)
+        kept = consistent[self.reference] if self.grouped and consistent is not None else np.ones(len(self.log), bool)
         log, reference = self.log[kept], self.reference[kept]
         if not len(log):
             return None

@@ -99,8 +99,8 @@ def export_geo(run: str | Path, out: str | Path, capture: str | Path | None = No
 def export_exif(run: str | Path, out: str | Path, capture: str | Path | None = None, unsure: bool = False) -> int:
     """Write copies of the query pictures with position and direction in EXIF; the pixels of JPEGs stay byte for byte.
 
-    Of a picture that was localized in several maps, the pose with the most inliers is taken; with `unsure`, also one of
-    low confidence. Times and other tags stay. Return the number of pictures.
+    Of a picture that was localized in several maps, the pose with the most inliers, then the surest, is taken; with
+    `unsure`, also one of low confidence. Times and other tags stay. Return the number of pictures.
 
     Raises:
         ManifestError: the folder `out` contains files.
@@ -112,7 +112,7 @@ def export_exif(run: str | Path, out: str | Path, capture: str | Path | None = N
     table = geo_table(run, capture)
     table = table.assign(sure=statuses(table["status"]) == str(Status.OK))
     table = table[table["latitude_deg"].notna() & (table["sure"] | unsure)]
-    table = table.sort_values(["sure", "num_inliers"], ascending=False, kind="stable")
+    table = table.sort_values("position_std_m").sort_values(["sure", "num_inliers"], ascending=False, kind="stable")
     table = table.drop_duplicates(["scene", "image"])
     if not len(table):
         raise ArtifactError(f"{run}: no query has a pose that is sure. Take the others by --unsure.")

@@ -84,8 +84,8 @@ def place(
     fitted = fit(source, target)
     if fitted is None:
         return Placing(None, record, [f"{how}: does not fit the model"])
-    new_from_old, inliers, residual_m, scale_deviation, level = fitted
-    facts = f"{np.count_nonzero(inliers)} of {len(common)} photographs, residual {residual_m:.2g} m in the median, "
+    new_from_old, fitting, residual_m, scale_deviation, level = fitted
+    facts = f"{np.count_nonzero(fitting)} of {len(common)} photographs, residual {residual_m:.2g} m in the median, "
     facts += f"scale known to {100 * scale_deviation:.1g} %"
     if scale_deviation > MAX_SCALE_DEVIATION:
         return Placing(None, record, [f"{how}: of no use for the scale, as the cameras are too close ({facts})"])
@@ -122,7 +122,7 @@ def fit(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, Floats, float, 
     """Fit a similarity to positions (N, 3) with outliers; z is up in both, and stays so if they do not tell it better.
 
     Returns:
-        target_from_source, inliers (N,), the median of their errors, the relative standard deviation of the scale, and
+        target_from_source, fitting (N,), the median of their errors, the relative standard deviation of the scale, and
         whether the positions told what is up; None if nothing fits.
     """
     for max_error in MAX_ERRORS_M:
@@ -135,8 +135,8 @@ def fit(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, Floats, float, 
     new_from_old = found["tgt_from_src"]
     for _ in range(3):
         errors = np.linalg.norm(new_from_old * source - target, axis=1)
-        inliers = errors <= max(OUTLIER * np.median(errors), 1e-9)
-        a, b = source[inliers], target[inliers]
+        fitting = errors <= max(OUTLIER * np.median(errors), 1e-9)
+        a, b = source[fitting], target[fitting]
         new_from_old = pycolmap.estimate_sim3d(a, b) or new_from_old
     errors = np.linalg.norm(new_from_old * a - b, axis=1)
     spread = np.linalg.svd(b - b.mean(axis=0), compute_uv=False)
@@ -151,7 +151,7 @@ def fit(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, Floats, float, 
         new_from_old = pycolmap.Sim3d(abs(turn), pycolmap.Rotation3d(rotation), shift)
         errors = np.linalg.norm(new_from_old * a - b, axis=1)
         sigma = np.sqrt((errors**2).sum() / max(3 * len(a) - 5, 1))
-    return new_from_old, inliers, float(np.median(errors)), float(sigma / max(np.linalg.norm(spread), 1e-9)), level
+    return new_from_old, fitting, float(np.median(errors)), float(sigma / max(np.linalg.norm(spread), 1e-9)), level
 
 
 def read_positions(path: Path) -> dict[str, Floats]:
