@@ -260,6 +260,12 @@ def test_an_estimate_in_doubt_says_why() -> None:
     assert camera.endswith("The focal length is 500 px.")
 
 
+def test_a_predicted_pose_says_how_many_references_agree() -> None:
+    named = {"references": ("a", "b"), "rejected": ("c",), "found_by": "feed_forward:simulated/feed_forward"}
+    predicted = QueryResult(Status.OK, **named)  # type: ignore[arg-type]
+    assert reason_in_words(predicted, {}, LocalizeSettings()) == "2 of 3 references agree on the pose."
+
+
 def test_a_list_chooses_what_is_shown(pair: InspectedPair, monkeypatch: pytest.MonkeyPatch) -> None:
     import IPython.display
     import ipywidgets

@@ -36,7 +36,7 @@ from toolkit.mapping.local_map import LocalMap
 from toolkit.pose.base import View
 from toolkit.pose.confidence import bounded_by_rivals
 from toolkit.pose.result import CAMERA, QueryResult, Status
-from toolkit.results.localized import QueryDetails, query_details, sure_points
+from toolkit.results.localized import QueryDetails, is_predicted, query_details, sure_points
 from toolkit.results.metrics import is_posed, pose_errors
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ class Answer:
     @property
     def texts(self) -> dict[str, str]:
         """The known numbers, errors and seconds as texts by their label."""
-        result, unit, numbers, by_network = self.result, self.unit[0], self.numbers, _is_by_network(self.result)
+        result, unit, numbers, by_network = self.result, self.unit[0], self.numbers, is_predicted(self.result.found_by)
         no_matches = not result.num_matches and (by_network or result.world_from_rig is not None)
         hidden = set(OF_MATCHES) if no_matches else set[str]()
         if not numbers.get("agreement"):
@@ -233,10 +233,6 @@ class Comparison:
 # In words
 
 
-def _is_by_network(result: QueryResult) -> bool:
-    return result.found_by == "feed_forward"
-
-
 def _consistent(result: QueryResult) -> str:
     """Return how many references of a predicted pose agree on it, such as `4 of 5`."""
     return f"{len(result.references)} of {len(result.references) + len(result.rejected)}"
@@ -293,7 +289,7 @@ def _doubts(numbers: Mapping[str, float], settings: LocalizeSettings) -> list[st
 
 
 def _support(result: QueryResult, numbers: Mapping[str, float]) -> list[str]:
-    if _is_by_network(result):
+    if is_predicted(result.found_by):
         return [f"{_consistent(result)} references agree on the pose."]
     if not numbers.get("num_matches"):
         return ["The pose comes from the references as a whole, not from matches."]

@@ -133,11 +133,16 @@ class QueryDetails:
         return [*agree[: REFERENCES - min(2, len(rejected))], *rejected][:REFERENCES]
 
 
+def is_predicted(method: str) -> bool:
+    """Tell whether a pose is that of a network, from the column `method`, such as `hybrid:vggt/feed_forward`."""
+    return method.rpartition("/")[2].startswith("feed_forward")
+
+
 def support_of(row: pd.Series) -> str:
     """Return the support of the pose in a row of a pair's csv as text, such as `120 inliers`; empty if it has none."""
     if row.get("num_inliers", 0) > 0:
         return f"{row['num_inliers']:.0f} inliers"
-    if row.get("method") == "feed_forward" and pd.notna(references := row.get("references", np.nan)):
+    if is_predicted(str(row.get("method"))) and pd.notna(references := row.get("references", np.nan)):
         return f"{references.count(';') + 1} consistent references"
     return ""
 
