@@ -540,16 +540,10 @@ def _write_poses(path: Path, rows: Sequence[dict[str, Any]], settings: LocalizeS
 
 
 def explain_query(
-    sessions_root: str | Path,
-    retrieval_dir: str | Path,
-    features_dir: str | Path,
-    map_dir: str | Path,
-    map_device: str,
-    query_device: str,
-    settings: LocalizeSettings,
-    queries: str = "keyframes_pruned_subsampled",
+    sessions_root: str | Path, retrieval_dir: str | Path, features_dir: str | Path, map_dir: str | Path,
+    map_device: str, query_device: str, settings: LocalizeSettings, queries: str = "keyframes_pruned_subsampled",
     index: int = 0,
-) -> tuple[FeedForwardLocalizer, Query, FeedForwardAnswer]:
+) -> tuple[FeedForwardLocalizer, Query, FeedForwardAnswer]:  # fmt: skip
     """Run the predictor on one query again, and return its full output, as `draw_prediction` takes it.
 
     Args:

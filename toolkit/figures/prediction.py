@@ -19,12 +19,9 @@ if TYPE_CHECKING:
 
 @styled
 def draw_prediction(
-    localizer: FeedForwardLocalizer,
-    query: Query,
-    answer: FeedForwardAnswer,
-    camera: int | None = None,
+    localizer: FeedForwardLocalizer, query: Query, answer: FeedForwardAnswer, camera: int | None = None,
     up: ArrayLike | None = None,
-) -> "Figure":
+) -> "Figure":  # fmt: skip
     """Draw one query image with its references, and the predicted cameras in the map; return the figure.
 
     Args:

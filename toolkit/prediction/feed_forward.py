@@ -82,15 +82,9 @@ class FeedForwardLocalizer(Localizer):
     """Localizes queries in one map by predicted cameras."""
 
     def __init__(
-        self,
-        local_map: LocalMap,
-        session: Session,
-        predictor: Predictor,
-        settings: PredictorSettings | None = None,
-        turns: Turns | None = None,
-        length: float = 1.0,
-        unit: tuple[str, float] = ("m", 1.0),
-    ):
+        self, local_map: LocalMap, session: Session, predictor: Predictor, settings: PredictorSettings | None = None,
+        turns: Turns | None = None, length: float = 1.0, unit: tuple[str, float] = ("m", 1.0),
+    ):  # fmt: skip
         """
         Args:
             local_map: the triangulated map.
