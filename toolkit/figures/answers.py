@@ -294,7 +294,7 @@ def _support(result: QueryResult, numbers: Mapping[str, float]) -> list[str]:
     if not numbers.get("num_matches"):
         return ["The pose comes from the references as a whole, not from matches."]
     counts = f"{numbers['num_inliers']:.0f} of {numbers['num_matches']:.0f}"
-    text = f"{counts} matches agree on the pose ({numbers.get('inlier_ratio', np.nan):.0%})"
+    text = f"{counts} descriptor matches are inliers ({numbers.get('inlier_ratio', np.nan):.0%})"
     coverage, rival = numbers.get("coverage", np.nan), numbers.get("rival_support", 0.0)
     best = f"The best other pose has {rival:.0%} of its support." if rival else "No other pose was found."
     return [text + (f", in {coverage:.0%} of the image." if coverage > 0 else "."), best]
