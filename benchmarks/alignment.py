@@ -168,7 +168,7 @@ def run(case: Case, trials: int, seed: int, noise_m: float, noise_deg: float) ->
         rows["error_deg"][row], rows["error_m"][row] = geometry.pose_error(pose, trial.world_from_query)
         rows["ok"][row] = is_trustworthy(alignment, covariance)
         rows["unknown"][row] = not alignment.scale_known
-        rows["found"][row] = np.array_equal(alignment.inliers, ~trial.wrong)
+        rows["found"][row] = np.array_equal(alignment.consistent, ~trial.wrong)
         if theirs := published(trial):
             rows["theirs_deg"][row], rows["theirs_m"][row] = geometry.pose_error(theirs[0], trial.world_from_query)
             rows["theirs_rmse"][row] = theirs[1]

@@ -157,7 +157,6 @@ def localize(capture: Path, run: Path, defaults: bool) -> None:
 def rows_of_run(capture_path: Path, run: Path) -> pd.DataFrame:
     """Return a row for each query of all pairs of a finished run."""
     from toolkit.capture import Capture, Trajectory
-    from toolkit.capture.tables import POSES_UNIT
     from toolkit.evaluate import pose_errors
     from toolkit.files import SceneFiles
 
@@ -166,7 +165,7 @@ def rows_of_run(capture_path: Path, run: Path) -> pd.DataFrame:
     for path in sorted(SceneFiles(run, capture.name).poses_dir.glob("*.csv")):
         truth = capture[f"{path.stem.rpartition('_query_')[2]}_query"].ground_truth
         assert truth is not None, f"{capture_path} has no ground truth"
-        table = pd.read_csv(path, dtype={"device_id": str}).rename(columns=POSES_UNIT)
+        table = pd.read_csv(path, dtype={"device_id": str}).rename(columns={"position_std_m": "position_std"})
         rotation_deg, distance_m = pose_errors(Trajectory.read(path.with_suffix(".txt")), truth, table)
         wrong = (rotation_deg > WRONG[0]) | (distance_m > WRONG[1])
         refused = table["status"].str.startswith("low_confidence: ")
@@ -210,7 +209,7 @@ def stated(rows: pd.DataFrame, weights: NDArray[np.float64]) -> NDArray[np.float
     alone = np.where(rows["posed"], probability_right(evidence, weights), 0.0)
     rivals = [[rival] if rival > 0 else [] for rival in rows["rival_support"]]
     bounded = map(bounded_by_rivals, alone, rivals)
-    return np.array(list(map(bounded_by_deviation, bounded, rows["position_std_m"], rows["rotation_std_deg"])))
+    return np.array(list(map(bounded_by_deviation, bounded, rows["position_std"], rows["rotation_std_deg"])))
 
 
 def judge(rows: pd.DataFrame, probability: NDArray[np.float64]) -> dict[str, float]:

@@ -80,7 +80,7 @@ def some_correspondences(
         pixels=np.round(rng.uniform(20, 100, (count, 2))),
         points=rng.normal(size=(count, 3)),
         point_index=np.arange(count) if point_index is None else np.full(count, point_index),
-        inlier=np.array(inliers, bool),
+        agrees=np.array(inliers, bool),
         found_by=np.array(["sift/descriptors" if point_index is None else "sift/lifted"] * count, np.str_),
         view_of=views[:, 0],
         view_reference=views[:, 1],

@@ -72,7 +72,7 @@ def indices_of(names: Sequence[str]) -> list[int]:
 def rests_on(estimate: QueryResult) -> tuple[Ints, Floats, Ints]:
     """Return query image (K,), pixels (K, 2) and map point (K,) of the guided matches that the pose agrees with."""
     matches = estimate.correspondences
-    kept = matches.inlier & np.char.endswith(matches.found_by, "/guided")
+    kept = matches.agrees & np.char.endswith(matches.found_by, "/guided")
     return matches.camera[kept], matches.pixels[kept], matches.point_index[kept]
 
 

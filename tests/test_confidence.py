@@ -30,7 +30,7 @@ def confidence() -> ModuleType:
 
 def rows(count: int, **columns: object) -> pd.DataFrame:
     plain = {"scene": "a", "posed": True, "wrong": False, "num_inliers": 100, "inlier_ratio": 0.5, "coverage": 0.5}
-    plain |= {"rival_support": 0.0, "agreement": 0, "position_std_m": 0.01, "rotation_std_deg": 0.1}
+    plain |= {"rival_support": 0.0, "agreement": 0, "position_std": 0.01, "rotation_std_deg": 0.1}
     plain |= {"refused": False, "way": "as it is", "escalated": False}
     return pd.DataFrame([plain | columns] * count)
 
@@ -52,14 +52,14 @@ def test_the_fit_finds_the_weights_that_made_the_rows(confidence: ModuleType) ->
 
 
 def test_more_evidence_is_never_less_probable() -> None:
-    plain = {"num_inliers": 30, "inlier_ratio": 0.2, "coverage": 0.4, "rival_support": 0.5, "position_std_m": 0.05}
+    plain = {"num_inliers": 30, "inlier_ratio": 0.2, "coverage": 0.4, "rival_support": 0.5, "position_std": 0.05}
     plain |= {"rotation_std_deg": 0.2, "agreement": 5}
-    better = {"num_inliers": 60, "inlier_ratio": 0.5, "coverage": 0.8, "rival_support": 0.1, "position_std_m": 0.01}
+    better = {"num_inliers": 60, "inlier_ratio": 0.5, "coverage": 0.8, "rival_support": 0.1, "position_std": 0.01}
     better |= {"rotation_std_deg": 0.05, "agreement": 50}
     for name, value in better.items():
         assert probability_right(plain | {name: value}) >= probability_right(plain), name
     assert 0 < probability_right(plain) < probability_right(better) <= 1
-    assert probability_right(plain | {"position_std_m": np.nan}) == 0
+    assert probability_right(plain | {"position_std": np.nan}) == 0
     together = {name: np.array([value, better[name]]) for name, value in plain.items()}
     np.testing.assert_array_equal(
         probability_right(together), [probability_right(plain), probability_right(better)]
@@ -67,7 +67,7 @@ def test_more_evidence_is_never_less_probable() -> None:
 
 
 def test_what_is_not_known_is_not_accepted(confidence: ModuleType) -> None:
-    unknown = pd.concat([rows(5, position_std_m=np.nan), rows(5, posed=False)], ignore_index=True)
+    unknown = pd.concat([rows(5, position_std=np.nan), rows(5, posed=False)], ignore_index=True)
     sure = np.array([100.0, *[0.0] * 7])
     assert confidence.judge(unknown, confidence.stated(unknown, sure))["accepted"] == 0
     assert confidence.judge(rows(5, rival_support=0.9), confidence.stated(rows(5), sure))["accepted"] == 0
@@ -107,7 +107,7 @@ def test_deviations_bound_the_probability() -> None:
     assert bounded_by_deviation(1.0, 0.5, 0.1) < 0.9, "an error of 0.5 m is as probable as not"
     assert bounded_by_deviation(1.0, 0.01, 5.0) < 0.9
     assert bounded_by_deviation(1.0, np.nan, 0.1) == 0
-    bounds = [bounded_by_deviation(1.0, position_std_m, 0.1) for position_std_m in np.linspace(0, 2, 11)]
+    bounds = [bounded_by_deviation(1.0, position_std, 0.1) for position_std in np.linspace(0, 2, 11)]
     assert bounds == sorted(bounds, reverse=True)
 
 

@@ -305,7 +305,7 @@ def test_python_examples_run(
     [keyframe] = names["query_keyframe"].to_dict("records")
     true = names["rig"].ground_truth.lookup([keyframe["timestamp"]], [keyframe["device_id"]])[0]
     assert max(pose_error(names["estimate_of_rig"].world_from_rig, true)) < 0.1
-    assert names["stored"].correspondences.inlier.sum() > 20
+    assert names["stored"].correspondences.agrees.sum() > 20
     assert names["alignment"].world_from_model.scale == pytest.approx(10)
     np.testing.assert_allclose(names["world_from_query"], names["world_from_cams"][3], atol=1e-6)
     assert names["scores"].shape == (2, 3)

@@ -17,6 +17,7 @@ from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.errors import COMMAND, ArtifactError, ManifestError
 from toolkit.evaluate import evaluate_scene
 from toolkit.exchange.export import export_colmap, export_pairs, export_poses
+from toolkit.exchange.geo import geo_table
 from toolkit.exchange.hloc import export_matches
 from toolkit.exchange.submission import collect
 from toolkit.figures.retrieval import RetrievedPair
@@ -178,6 +179,10 @@ def exported_matches(files: SceneFiles, capture: Path) -> str:
     return str(export_matches(files.run, files.scene, "ios_map", "ios_map", files.run / "hloc.h5", capture=capture))
 
 
+def exported_geo(files: SceneFiles, capture: Path) -> str:
+    return str(geo_table(files.run, capture))
+
+
 def linked_report(files: SceneFiles, capture: Path) -> str:
     return str(Run.open(files.run).report())
 
@@ -187,6 +192,7 @@ FEATURES, RECORD = "features", "run.json"
 READERS = [
     (POSES, reported, "Not shown: recall.csv is of an older poses/"),
     (TABLE, reported, "Not shown: recall.csv is of an older poses/"),
+    (POSES, reported, "pictures and recordings."),
     (REFERENCES, reported, "Not shown: recall.csv is of an older"),
     (VECTORS, reported, "run the retrieve stage again"),
     (POSES, compared, "run the evaluate stage again"),
@@ -204,6 +210,8 @@ READERS = [
     (VECTORS, exported_pairs, "run the retrieve stage again"),
     (REFERENCES, exported_poses, "run the localize stage again"),
     (MAP, exported_poses, "run the localize stage again"),
+    (REFERENCES, exported_geo, "run the localize stage again"),
+    (MAP, exported_geo, "run the localize stage again"),
     (FEATURES, opened, "of other images or features: run the localize stage again"),
     (FEATURES, inspected_again, "of other images or features: run the localize stage again"),
     (FEATURES, exported_map, "of other images or features: run the localize stage again"),
@@ -323,36 +331,74 @@ def test_a_run_with_other_settings_leaves_the_finished_one_as_it_is(linked: Scen
     assert "nearest" in taken.poses_csv("ios", "hl").read_text()
 
 
+NETWORK = {"name": "da3-small", "checkpoint": "$MADE/da3-small.safetensors", "num_references": 3}
 METHODS: dict[str, dict[str, Any]] = {
     "pnp": {"method": "pnp", "pnp": {"max_error_deg": 0.4}},
     "nearest": {"method": "nearest"},
     "feed_forward": {"method": "feed_forward", "predictor": "simulated"},
     "hybrid": {"method": "hybrid", "predictor": "simulated"},
     "aliked": {"method": "pnp", "features": {"kinds": ["aliked"]}, "matcher": {"name": "mutual"}},
-}
+    "aliked, lightglue": {"method": "pnp", "features": {"kinds": ["aliked"]}},
+    "sift and aliked": {"method": "pnp", "features": {"kinds": ["sift", "aliked"]}},
+    "superpoint": {
+        "method": "pnp", "features": {"kinds": ["superpoint"], "checkpoint": "$MADE/superpoint.safetensors"},
+        "matcher": {"name": "mutual"},
+    },
+    "superpoint, lightglue": {
+        "method": "pnp", "features": {
+            "kinds": ["superpoint"], "checkpoint": "$MADE/superpoint.safetensors", "superpoint": {"max_keypoints": 512},
+        },
+        "matcher": {"checkpoint": "$MADE/lightglue.safetensors"},
+    },
+    "a network, feed_forward": {"method": "feed_forward", "predictor": NETWORK},
+    "a network, hybrid": {"method": "hybrid", "predictor": NETWORK},
+}  # fmt: skip
+DOORS = [(name, "ios", "ios") for name in METHODS] + [
+    (name, "ios", "spot") for name in ("pnp", "hybrid", "aliked", "superpoint", "a network, hybrid")
+]
+
+
+@pytest.fixture
+def made_weights(made_once: Callable[[str, Callable[[Path], object]], Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    """$MADE is a folder with random weights of SuperPoint, its LightGlue and Depth Anything 3 Small."""
+    from safetensors.torch import save_file
+
+    from tests.features import test_lightglue, test_superpoint
+    from tests.golden import da3
+
+    def make(folder: Path) -> None:
+        states = {"superpoint": test_superpoint.random_state(), "lightglue": test_lightglue.random_state()}
+        states["da3-small"] = da3.state(da3.shapes("da3-small"))
+        for name, state in states.items():
+            save_file({key: value.clone() for key, value in state.items()}, folder / f"{name}.safetensors")
+
+    monkeypatch.setenv("MADE", str(made_once("weights", make)))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(("name", "map_device", "query_device"), DOORS)
 def test_every_door_gives_the_same_poses(
     linked: SceneFiles, small_capture: Path, tmp_path: Path, released_weights: None,
-    request: pytest.FixtureRequest, name: str,
+    request: pytest.FixtureRequest, name: str, map_device: str, query_device: str,
 ) -> None:  # fmt: skip
     """A run, the notebook by hand, one image at a time and inspection, with a unit that the import did not know."""
     method = METHODS[name]
-    if name == "aliked":
+    if "aliked" in name:
         request.getfixturevalue("learned_weights")
-    manifest, devices = linked.run.parent / f"{linked.run.name}.yaml", ("ios", "ios")
+    if "$MADE" in str(method):
+        request.getfixturevalue("made_weights")
+    manifest, devices = linked.run.parent / f"{linked.run.name}.yaml", (map_device, query_device)
     capture = Path(shutil.copytree(small_capture, tmp_path / "copy" / small_capture.name))
     for record in capture.glob("sessions/*"):
         (record / IMPORT_RECORD).parent.mkdir(exist_ok=True)
         (record / IMPORT_RECORD).write_text('{"unit": null}')
-    content = f"captures: ['{capture}']\noutput_root: .\npairs: [[ios, ios]]\n"
+    content = f"captures: ['{capture}']\noutput_root: .\npairs: [[{map_device}, {query_device}]]\n"
     manifest.write_text(f"{content}localize: {json.dumps(method)}\n")
     shutil.rmtree(linked.poses_dir)  # the other pairs would be of an older map
     pipeline.run(manifest, only="embed,retrieve,localize", say=quiet, in_place=True)
     path, run = linked.poses_txt(*devices), Run.open(linked.run)
-    results, unit = PairResults.open(path), read_map_record(map_record_path(linked.poses_dir, "SMALL", "ios"))["unit"]
+    record = map_record_path(linked.poses_dir, "SMALL", map_device)
+    results, unit = PairResults.open(path), read_map_record(record)["unit"]
     assert len(results) == 2
     assert unit is None
     # by hand
@@ -364,18 +410,19 @@ def test_every_door_gives_the_same_poses(
     papermill.execute_notebook(notebook_path("localize"), None, parameters | folders, progress_bar=False)
     assert (tmp_path / "out_dir" / path.name).read_bytes() == path.read_bytes()
     by_run, by_hand = (pd.read_csv(one / f"{path.stem}.csv") for one in (linked.poses_dir, tmp_path / "out_dir"))
-    pd.testing.assert_frame_equal(by_run.drop(columns="seconds"), by_hand.drop(columns="seconds"))
-    assert read_map_record(map_record_path(tmp_path / "out_dir", "SMALL", "ios"))["unit"] == unit
-    # one image, and inspection
-    place, session = run.map("ios"), Capture.open(capture)["ios_query"]
+    pd.testing.assert_frame_equal(*(one.filter(regex="^(?!(first_)?seconds$)") for one in (by_run, by_hand)))
+    assert read_map_record(map_record_path(tmp_path / "out_dir", "SMALL", map_device))["unit"] == unit
+    # one image, or the images of one rig, and inspection
+    place, session = run.map(map_device), Capture.open(capture)[f"{query_device}_query"]
     assert place.settings.unit == unit
     inspected = InspectedPair(*devices, linked.poses_dir)
     for number, rows in enumerate(session.rows_of_keyframes(results.table)):
-        one, (row,) = results[number], rows.tolist()
-        if "predictor" in method:  # it predicts images of the capture only
+        one = results[number]
+        if method.get("predictor") == "simulated":  # it predicts images of the capture only
             found = place.locate(place.query_of_session(session, rows))
         else:
-            found = localize_image(place, session.image_path(row), session.camera(session.images["sensor_id"][row]))
+            paths = [session.image_path(row) for row in rows.tolist()]
+            found = localize_image(place, paths, session.cameras(rows), session.rig_from_cam(rows))
         shown = inspected.look(number)
         assert shown.result.status_text == found.status_text == one.status_text
         assert shown.unit == results.unit

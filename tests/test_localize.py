@@ -371,7 +371,7 @@ def test_a_fault_of_the_toolkit_is_tried_again_by_the_next_run(
     assert len(calls) == 1, "of that query alone"
     assert not table["skipped"].item()
     assert run.poses_txt("ios", "ios").read_bytes() == finished[0].poses_txt("ios", "ios").read_bytes()
-    assert all(query.correspondences.inlier.any() for query in PairResults.open(run.poses_txt("ios", "ios")))
+    assert all(query.correspondences.agrees.any() for query in PairResults.open(run.poses_txt("ios", "ios")))
     assert run_stage(small_capture, run, query_device="ios")["skipped"].item()
 
 
@@ -513,7 +513,7 @@ def test_a_first_answer_that_is_not_bettered_stays(
     for both in zip(*(PairResults.open(files.poses_txt("ios", "ios")) for files in (run, finished[0])), strict=True):
         a, b = (result.correspondences for result in both)
         np.testing.assert_array_equal(a.pixels, b.pixels)
-        np.testing.assert_array_equal(a.inlier, b.inlier)
+        np.testing.assert_array_equal(a.agrees, b.agrees)
 
 
 def test_a_query_without_references_asks_for_nothing_more(
@@ -576,7 +576,7 @@ def test_a_run_killed_at_its_end_leaves_no_files_of_two_runs(small_capture: Path
     assert not run.poses_txt("ios", "ios").exists()
     run_stage(small_capture, run, query_device="ios")
     assert run.poses_txt("ios", "ios").read_bytes() == before
-    assert all(query.correspondences.inlier.any() for query in PairResults.open(path))
+    assert all(query.correspondences.agrees.any() for query in PairResults.open(path))
 
 
 @pytest.mark.slow
@@ -872,7 +872,7 @@ def test_a_run_whose_capture_has_moved_opens_after_the_next_run(
     assert place.session.path == moved / "sessions" / "ios_map"
     assert place.settings.compute_device == "cpu", "as the last run had it"
     path = run.poses_txt("ios", "ios").with_suffix(".h5")
-    assert all(query.correspondences.inlier.any() for query in PairResults.open(path))
+    assert all(query.correspondences.agrees.any() for query in PairResults.open(path))
     stamp = path.stat().st_mtime_ns
     run_stage(moved, run, query_device="ios", compute_device="cpu")
     assert path.stat().st_mtime_ns == stamp
@@ -1114,7 +1114,7 @@ def test_pictures_and_inspections_get_the_pose_of_the_run_byte_for_byte(
             assert (again.result.status, again.numbers["num_inliers"]) == (estimate.status, estimate.num_inliers)
         before = localized[number].correspondences
         np.testing.assert_array_equal(before.point_index, estimate.correspondences.point_index)
-        np.testing.assert_array_equal(before.inlier, estimate.correspondences.inlier)
+        np.testing.assert_array_equal(before.agrees, estimate.correspondences.agrees)
 
 
 def test_the_unit_that_an_import_noted_is_that_of_every_door(capture: Path, run: SceneFiles) -> None:

@@ -115,6 +115,43 @@ def test_a_notebook_by_hand_takes_what_the_run_has_and_writes_beside_it(
         notebook.start("retrieve", run=str(tmp_path / "fos"), map_feats_root=None, out_jsonl=None)
 
 
+BY_HAND: dict[str, dict[str, Any]] = {
+    "explore": {"samples": 1},
+    "embed": {"settings": {"seed": 1}},
+    "retrieve": {"topk": 2},
+    "rerank": {"topn": 5, "topk": 3},
+    "localize": {"method": "nearest"},
+    "sequence": {"position_drift": 0.1},
+    "evaluate": {"thresholds": [[2, 0.2]]},
+    "visualize": {"samples": 0},
+    "own_images": {"device": "own"},
+    "compare": {"pictures": 1},
+    "start": {"map_device": "hl"},
+}
+"""Notebooks, and a parameter that is not as in the run."""
+
+
+@pytest.mark.slow
+def test_all_notebooks_by_hand_leave_a_finished_run_as_it_is(
+    small_run: Path, tmp_path: Path, released_weights: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Path(shutil.copytree(small_run, tmp_path / "run"))
+    monkeypatch.chdir(tmp_path)
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    assert len(before) > 100
+    assert {notebook_path(name) for name in BY_HAND} == set(notebook_path("start").parent.glob("*.ipynb"))
+    places = {"own_images": {"out_dir": str(tmp_path / "own")}, "compare": {"others": [str(small_run)]}}
+    for name, other in BY_HAND.items():
+        if name == "sequence":
+            pytest.importorskip("gtsam")
+        parameters = {"run": str(run)} | other | places.get(name, {})
+        notebook.execute(notebook_path(name), tmp_path / f"{name}.ipynb", parameters)
+        assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before, name
+    own = tmp_path / "run-by-hand" / "SMALL"
+    for name in ("retrieval/SMALL_map_ios_query_hl.jsonl", "poses/SMALL_map_ios_query_hl.txt"):
+        assert (own / name).read_bytes() != (run / "SMALL" / name).read_bytes(), "it did as it was told, elsewhere"
+
+
 @pytest.mark.parametrize("stage", STAGES)
 def test_every_parameter_has_a_comment(stage: str) -> None:
     lines = nbformat.read(notebook_path(stage), as_version=4).cells[1].source.splitlines()
@@ -208,6 +245,12 @@ def test_a_wrong_parameter_is_named_as_in_its_cell(name: str) -> None:
 def test_what_a_wrong_parameter_means_is_said(name: str, wrong: dict[str, Any], named: str) -> None:
     with pytest.raises(ManifestError, match=named):
         notebook.check_values(name, wrong)
+
+
+def test_values_that_fit_each_other_need_not_fit_the_defaults() -> None:
+    notebook.check_values("rerank", {"topn": 5, "topk": 3})
+    with pytest.raises(ManifestError, match="expected topk to be at most topn"):
+        notebook.check_values("rerank", {"topn": 5, "topk": 6})
 
 
 def test_a_notebook_shows_an_error_without_frames_of_the_toolkit() -> None:

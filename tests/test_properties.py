@@ -512,8 +512,8 @@ def test_a_known_similarity_is_found(
     model[:wrong, :3, :3] = geometry.quaternion_to_rotation(rng.normal(size=(wrong, 4)))
     model[:wrong, :3, 3] += rng.normal(0, 20 * spread_m / truth.scale, (wrong, 3))
     found = align_to_map(model, world)
-    assert found.inliers[wrong:].all()
-    assert not found.inliers[:wrong].any()
+    assert found.consistent[wrong:].all()
+    assert not found.consistent[:wrong].any()
     np.testing.assert_allclose(found.world_from_model.rotation, truth.rotation, atol=1e-6)
     np.testing.assert_allclose(found.world_from_model.apply_to_pose(model[wrong:]), world[wrong:], atol=0.02 * spread_m)
 

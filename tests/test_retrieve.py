@@ -455,17 +455,17 @@ def test_references_come_from_near_rough_poses_and_fixes(tiny: Path, tmp_path: P
         asked = {"map_device": "ios", "query_device": "ios", "settings": {"topk": 1, "mask": mask}}
         return retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", **asked).iloc[0]
 
-    row = retrieve(poses=str(rough), poses_distance_m=2)
+    row = retrieve(poses=str(rough), poses_distance=2)
     assert first_walls(row["path"]) == [2, 1, 2]
     assert row["without_poses"] == 2
     row = retrieve(gps=True)
     assert first_walls(row["path"]) == [0, 2, 2]
     assert row["without_gps"] == 0
-    row = retrieve(gps=True, poses=str(rough), poses_distance_m=2)
+    row = retrieve(gps=True, poses=str(rough), poses_distance=2)
     assert first_walls(row["path"]) == [2, 2, 2], "a rough pose outdoes the fix that contradicts it"
     assert (row["without_poses"], row["without_gps"]) == (2, 1)
     rough.write_text(rough.read_text().replace(" 900", " 10"))
-    again = retrieve(gps=True, poses=str(rough), poses_distance_m=2)
+    again = retrieve(gps=True, poses=str(rough), poses_distance=2)
     assert (again["skipped"], again["without_poses"]) == (False, 1)
     with pytest.raises(ManifestError, match=r"retrieve\.mask\.poses: found no file .*nowhere\.txt"):
         retrieve(poses=str(tmp_path / "nowhere.txt"))

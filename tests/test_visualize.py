@@ -57,7 +57,7 @@ def test_the_worst_come_first_by_error_and_pictures_show_their_own_inliers(small
         ["ios", "ios", 3, 3],
         ["ios", "hl", 1, 1],
     ]
-    worst = [round(query.translation_m, 6) for query in drawn["worst"]]
+    worst = [round(query.translation, 6) for query in drawn["worst"]]
     assert worst == [0.3, 0.2, 0.1, 0.0]
     assert drawn["worst"][0].reason == "ok, 2 inliers"
     np.testing.assert_array_equal(drawn["worst"][0].details.cameras[0].pixels, queries[1].correspondences.pixels)

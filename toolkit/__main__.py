@@ -202,7 +202,7 @@ def localize(
             poses.append(result.world_from_rig)
             unknown = {} if place.settings.unit else {"unit": "unknown"}  # as in a table of poses
             row |= {"world_from_cam": result.world_from_rig.tolist(), **unknown}
-            row["position_std" if unknown else "position_std_m"] = result.position_std_m
+            row["position_std" if unknown else "position_std_m"] = result.position_std
             if origin is not None:
                 geo = geographic_poses(poses[-1][None], origin)[0].tolist()
                 row |= {name: None if np.isnan(one) else one for name, one in zip(GEO_COLUMNS, geo, strict=True)}

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.devices import in_order
+from toolkit.capture.tables import POSES_UNIT
 from toolkit.errors import ArtifactError, CaptureError, ToolkitError
 from toolkit.figures.evaluation import Evaluation, draw_evaluation
-from toolkit.figures.sequences import SequencePair
+from toolkit.figures.sequences import SequencePair, warn_of_older
 from toolkit.figures.style import save_figure
 from toolkit.files import (
     map_record_path,
@@ -215,6 +216,7 @@ def evaluate_sequences(
         or ground truth.
     """
     steps, changes = [pd.DataFrame()], [pd.DataFrame()]
+    warn_of_older(poses_dir)
     for map_, query in _chosen((map_devices, query_devices), pairs):
         sequence = SequencePair.find(poses_dir, capture.name, map_, query)
         if sequence is None:
@@ -312,7 +314,8 @@ def _read_results(path: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
         require_whole(table, of=path)
         if not table.is_file():  # another tool writes only poses; then every pose counts as ok
             return results, "evaluated"
-        details = keys.merge(PairResults.open(path, whole=False).table.drop_duplicates(_KEY), how="left", on=_KEY)
+        rows = PairResults.open(path, whole=False).table.rename(columns=POSES_UNIT)
+        details = keys.merge(rows.drop_duplicates(_KEY), how="left", on=_KEY)
     except ArtifactError as error:
         return results, f"unreadable table of queries ({error})"
     results = results.assign(**{name: details[name].astype(float) for name in DETAILS if name in details})
@@ -353,30 +356,30 @@ def _errors_of(
         frame = frame.iloc[device].reset_index(drop=True)
         frame.insert(2, "sensor_id", session.images["sensor_id"].to_numpy()[images])
         frame["image"] = session.own_names(images[:, None])
-    rotation_deg, translation_m = pose_errors(estimated, true)
-    translation_m /= length
+    rotation_deg, translation = pose_errors(estimated, true)
+    translation /= length
     if "position_std_m" in frame:
         frame["position_std_m"] /= length
-    frame["rotation_error_deg"], frame["translation_error_m"] = rotation_deg, translation_m
+    frame["rotation_error_deg"], frame["translation_error_m"] = rotation_deg, translation
     no_reference = np.zeros(len(frame), bool) if good is None else ~frame["good_reference"].to_numpy(bool)
     why_not, wrong = [metrics.NO_REFERENCE, metrics.NO_POSE], metrics.WRONG_POSE
     reason = np.select([no_reference, ~np.isfinite(rotation_deg)], why_not, wrong)
     for threshold in thresholds:
-        hit = metrics.is_below(rotation_deg, translation_m, threshold)
+        hit = metrics.is_below(rotation_deg, translation, threshold)
         frame[f"loss@{metrics.threshold_name(threshold, unit)}"] = np.where(hit, "", reason)
     return frame
 
 
 def _summary(frame: pd.DataFrame, thresholds: Sequence[metrics.Threshold], unit: str) -> dict[str, Any]:
     """Return a pair's row of the table `recall`."""
-    rotation_deg, translation_m = (frame[name].to_numpy(float) for name in ERROR_COLUMNS[-2:])
+    rotation_deg, translation = (frame[name].to_numpy(float) for name in ERROR_COLUMNS[-2:])
     status = statuses(frame["status"])
-    wrong = (status == Status.OK) & ~metrics.is_below(rotation_deg, translation_m, metrics.WRONG)
+    wrong = (status == Status.OK) & ~metrics.is_below(rotation_deg, translation, metrics.WRONG)
     return {
         "queries": len(frame),
         "localized": int(np.isfinite(rotation_deg).sum()),
         **status_counts(frame["status"]),
-        **metrics.summary_of(rotation_deg, translation_m, thresholds, unit),
+        **metrics.summary_of(rotation_deg, translation, thresholds, unit),
         "ok_wrong": float(np.mean(wrong)),
     }
 

@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
-from toolkit.capture.tables import in_unit_of_poses, read_query_table
+from toolkit.capture.tables import POSES_UNIT, in_unit_of_poses, read_query_table
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import ToolkitError, reason_of
 from toolkit.features.matching import AnyMethod, MutualMatcher, resolve_auto, weights_files
@@ -510,7 +510,8 @@ def _write_poses(path: Path, rows: Sequence[dict[str, Any]], settings: LocalizeS
     columns = [*COLUMNS, *(PREDICTION_COLUMNS if settings.predicts else [])]
     columns += FALLBACK_COLUMNS if settings.features.escalation else []
     with write_atomic(path.with_suffix(".csv")) as temporary:
-        in_unit_of_poses(pd.DataFrame(rows, columns=columns), settings.unit).to_csv(temporary, index=False)
+        table = pd.DataFrame(rows).rename(columns=POSES_UNIT).reindex(columns=columns)
+        in_unit_of_poses(table, settings.unit).to_csv(temporary, index=False)
     posed = [row for row in rows if np.isfinite(row["world_from_rig"]).all()]
     covariances = np.array([row["covariance"] for row in posed]).reshape(-1, 6, 6)
     Trajectory.from_poses(
@@ -522,14 +523,8 @@ def _write_poses(path: Path, rows: Sequence[dict[str, Any]], settings: LocalizeS
 
 
 def explain_query(
-    sessions_root: str | Path,
-    retrieval_dir: str | Path,
-    features_dir: str | Path,
-    map_dir: str | Path,
-    map_device: str,
-    query_device: str,
-    settings: LocalizeSettings,
-    queries: str = "keyframes_pruned_subsampled",
+    sessions_root: str | Path, retrieval_dir: str | Path, features_dir: str | Path, map_dir: str | Path,
+    map_device: str, query_device: str, settings: LocalizeSettings, queries: str = "keyframes_pruned_subsampled",
     index: int = 0,
 ) -> tuple[FeedForwardLocalizer, Query, FeedForwardAnswer]:
     """Run the predictor on one query of a pair again, by its index in the keyframe list, with what `localize_pairs` was

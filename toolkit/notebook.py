@@ -13,6 +13,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from html import escape
 from importlib import import_module
 from pathlib import Path
@@ -571,6 +572,10 @@ def check_values(name: str, values: Mapping[str, Any]) -> None:
     path, given = notebook_path(name), dict[str, Any]()
     defaults, meanings = notebook_parameters(path), dict(re.findall(r"^(\w+) = .*  # (.+)", _listing(path), re.M))
     of_stage = {"settings", *type(Manifest.defaults(name)).model_fields} if name in STAGES else set()
+    if of_stage:
+        with suppress(ManifestError):  # together, as one that fits the others need not fit their defaults
+            stage_settings(name, values)
+            values = {key: value for key, value in values.items() if key not in of_stage}
     for key in [key for key in defaults if key in values]:
         given[key] = values[key]
         try:

@@ -296,7 +296,7 @@ def _masks(
     images = (database.session, database.rows), (query.session, query.rows)
     priors = dict[str, Masks]()
     if poses is not None:
-        priors["poses"] = pose_masks(poses, *images, mask.poses_distance_m, MAX_ANGLE_DEG)
+        priors["poses"] = pose_masks(poses, *images, mask.poses_distance, MAX_ANGLE_DEG)
     if mask.gps:
         priors["gps"] = gps_masks(*images, GPS_MARGIN_M, WINDOW_S)
     if mask.radio:
@@ -317,7 +317,7 @@ def _mask_record(settings: MaskSettings, *sessions: Session) -> dict[str, Any]:
     record: dict[str, Any] = {}
     names: list[str] = []
     if settings.poses:
-        record["poses"] = [file_fingerprint(settings.poses), settings.poses_distance_m, MAX_ANGLE_DEG]
+        record["poses"] = [file_fingerprint(settings.poses), settings.poses_distance, MAX_ANGLE_DEG]
     if settings.gps:
         record["gps"], names = [GPS_MARGIN_M, WINDOW_S], ["gps.txt"]
     if settings.radio:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
-from toolkit.capture.tables import POSE_NAMES, POSES_UNIT, KeyIndex, as_strings, in_unit_of_poses
+from toolkit.capture.tables import POSE_NAMES, KeyIndex, as_strings, in_unit_of_poses
 from toolkit.errors import OF_THE_DATA, ArtifactError, reason_of
 from toolkit.files import (
     SceneFiles,
@@ -162,12 +162,12 @@ def _place_pair(
                 rows.to_csv(temporary, index=False)
         trajectory.write(out)
         write_sidecar(out, record, list(csvs), made_from=inputs, unfinished=again is not None and again.met_a_bug)
-    frames = pd.read_csv(out.with_suffix(".csv"), keep_default_na=False).rename(columns=POSES_UNIT)
+    frames = pd.read_csv(out.with_suffix(".csv"), keep_default_na=False)
     return {
         "frames": len(frames),
         **status_counts(frames["status"]),
         "pieces": len(frames[["recording", "piece"]].drop_duplicates()),
-        "queries": int((frames["moved_m"] != "").sum()),
+        "queries": int((frames["turned_deg"] != "").sum()),
         "again": int((frames["again_status"] != "").sum()),
         "used": int((frames["used"].astype(str) == "True").sum()),
         "seconds": round(time.perf_counter() - started, 2),

@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, DamagedError
 from toolkit.figures.query_images import WorstQuery, draw_localization, draw_worst
-from toolkit.figures.sequences import SequencePair, draw_sequence
+from toolkit.figures.sequences import SequencePair, draw_sequence, warn_of_older
 from toolkit.figures.style import save_figure
 from toolkit.figures.top_view import draw_scene
 from toolkit.files import pair_name, require_current, sidecar_path, write_sidecar
@@ -84,6 +84,7 @@ def visualize_scene(
     sheet = out / f"worst_{capture.name}.png"
     for path in (sheet, sidecar_path(sheet)):
         path.unlink(missing_ok=True)
+    warn_of_older(poses_dir)
     for m, q in tqdm(chosen, desc="visualize", unit="pair"):
         name = pair_name(capture.name, m, q)
         _remove_images(out, name)  # those of an earlier run would look like results of this one
@@ -203,11 +204,10 @@ def _draw_worst(path: Path, scene: str, candidates: pd.DataFrame) -> None:
     """Draw the worst queries of all pairs; `candidates` are the rows of `_draw_pair`."""
     shown = []
     for _, row in named_as_meters(candidates.iloc[worst_first(candidates)[:WORST]]).iterrows():
-        has_matches, reason = row["details"].has_matches, [textwrap.shorten(row["status"], 72, placeholder=" …")]
-        if has_matches and pd.notna(row.get("num_matches")):
+        reason = [textwrap.shorten(row["status"], 72, placeholder=" …")]
+        if row["details"].has_matches and pd.notna(row.get("num_matches")):
             reason.append(f"{row['num_matches']:.0f} matches")
-        if has_matches or row.get("num_inliers", 0) > 0:
-            reason.append(support_of(row))
+        reason += filter(None, [support_of(row)])
         errors = row["rotation_error_deg"], row["translation_error_m"]
         shown.append(WorstQuery(row["pair"], ", ".join(reason), row["details"], *errors, row["unit"]))
     title = f"{scene}: the {len(shown)} worst queries of all pairs"

@@ -32,7 +32,7 @@ def test_mean_of_equal_poses_is_that_pose() -> None:
     for count in (1, 2, 7):
         mean = mean_of(np.stack([pose] * count))
         np.testing.assert_allclose(mean.world_from_cam, pose, atol=1e-12)
-        assert mean.inliers.all()
+        assert mean.consistent.all()
         assert (np.linalg.eigvalsh(mean.covariance) > 0).all()
         assert mean.reason == ""
 
@@ -52,7 +52,7 @@ def test_mean_follows_a_change_of_the_world_and_the_order() -> None:
     moved = mean_of(new_from_world @ poses[order])
     np.testing.assert_allclose(moved.world_from_cam, new_from_world @ mean.world_from_cam, atol=1e-9)
     np.testing.assert_allclose(moved.covariance, mean.covariance, atol=1e-9)
-    np.testing.assert_array_equal(moved.inliers, mean.inliers[order])
+    np.testing.assert_array_equal(moved.consistent, mean.consistent[order])
 
 
 def test_mean_leaves_out_what_is_far() -> None:
@@ -60,7 +60,7 @@ def test_mean_leaves_out_what_is_far() -> None:
     poses[[0, 5, 7]] = random_poses(3, 45, spread_m=5)
     poses[2, 0, 0] = np.nan
     mean = mean_of(poses)
-    np.testing.assert_array_equal(np.flatnonzero(mean.inliers), [1, 3, 4, 6])
+    np.testing.assert_array_equal(np.flatnonzero(mean.consistent), [1, 3, 4, 6])
     degrees, meters = geometry.pose_error(mean.world_from_cam, pose)
     assert degrees < 2
     assert meters < 0.1
@@ -72,12 +72,12 @@ def test_two_camps_of_poses_and_opposite_rotations_are_undecided() -> None:
     _, first = scattered(3, 46)
     _, second = scattered(3, 47)
     mean = mean_of(np.concatenate([first, second]))
-    assert mean.inliers.tolist() in ([True] * 3 + [False] * 3, [False] * 3 + [True] * 3)
+    assert mean.consistent.tolist() in ([True] * 3 + [False] * 3, [False] * 3 + [True] * 3)
     assert np.isinf(np.diagonal(mean.covariance)).all()
     assert "undecided" in mean.reason
     opposite = np.stack([np.eye(4), geometry.make_pose(np.diag([1.0, -1, -1]), np.zeros(3))])
     mean = mean_of(opposite)
-    assert mean.inliers.sum() == 1
+    assert mean.consistent.sum() == 1
     assert np.isinf(np.diagonal(mean.covariance)).all()
 
 

@@ -69,7 +69,7 @@ def test_exact_cameras_give_the_exact_similarity(count: int) -> None:
     expected, model, world = exact(count, seed=count)
     found = align_to_map(model, world)
     assert_same_sim3(found.world_from_model, expected)
-    assert found.inliers.all()
+    assert found.consistent.all()
     assert found.scale_known
     assert found.scale_std < 0.05
     assert found.rmse_m < 1e-9
@@ -89,7 +89,7 @@ def test_exact_cameras_with_wrong_ones_give_the_exact_similarity() -> None:
     expected, model, world = exact(8, seed=4)
     model[[1, 4, 6]] = random_poses(3, 5)
     found = align_to_map(model, world)
-    np.testing.assert_array_equal(np.flatnonzero(~found.inliers), [1, 4, 6])
+    np.testing.assert_array_equal(np.flatnonzero(~found.consistent), [1, 4, 6])
     assert_same_sim3(found.world_from_model, expected)
     assert "references 1, 4, 6 left out" in found.reason
 
@@ -116,7 +116,7 @@ def test_a_change_of_either_frame_is_followed(ratios: int) -> None:
         new_from_world @ trial.world_from_cams,
         depth_ratios=moved_ratios,
     )
-    np.testing.assert_array_equal(moved.inliers, found.inliers)
+    np.testing.assert_array_equal(moved.consistent, found.consistent)
     assert moved.scale_std == pytest.approx(found.scale_std, rel=1e-6)
     assert moved.rotation_std_deg == pytest.approx(found.rotation_std_deg, rel=1e-6)
     assert moved.rmse_m == pytest.approx(found.rmse_m, rel=1e-6)
@@ -130,7 +130,7 @@ def test_order_does_not_matter() -> None:
     trial, order = noisy(Case("", 1.0, wrong=3), seed=10), np.random.default_rng(11).permutation(8)
     found = align_to_map(trial.model_from_cams, trial.world_from_cams)
     other = align_to_map(trial.model_from_cams[order], trial.world_from_cams[order])
-    np.testing.assert_array_equal(other.inliers, found.inliers[order])
+    np.testing.assert_array_equal(other.consistent, found.consistent[order])
     assert_same_sim3(other.world_from_model, found.world_from_model, 1e-7)
 
 
@@ -158,7 +158,7 @@ def test_references_at_one_place_give_rotation_but_no_scale(count: int) -> None:
     expected, model, world = exact(count, seed=13, spread_m=0.0)
     found = align_to_map(model, world)
     assert_unknown(found)
-    assert found.inliers.all()
+    assert found.consistent.all()
     assert np.isfinite(found.rotation_std_deg)
     np.testing.assert_allclose(found.world_from_model.rotation, expected.rotation, atol=1e-9)
     np.testing.assert_allclose(found.world_from_model.transform(model[:, :3, 3]), world[:, :3, 3], atol=1e-9)
@@ -186,7 +186,7 @@ def test_no_reference() -> None:
         align_to_map(np.full((2, 4, 4), np.nan), random_poses(2, 16)),
         align_to_map(random_poses(2, 16), random_poses(2, 16), weights=[0, 0]),
     ):
-        assert not found.inliers.any()
+        assert not found.consistent.any()
         assert np.isinf([found.scale_std, found.rotation_std_deg]).all()
         assert "no usable reference" in found.reason
         _, covariance = query_pose(found, np.eye(4))
@@ -200,7 +200,7 @@ def test_cameras_that_are_not_finite_are_left_out(which: str, value: float) -> N
     (model if which == "model" else world)[2, 0, 3] = value
     found = align_to_map(model, world)
     assert_same_sim3(found.world_from_model, expected)
-    np.testing.assert_array_equal(found.inliers, np.arange(6) != 2)
+    np.testing.assert_array_equal(found.consistent, np.arange(6) != 2)
     assert "references 2 left out: not finite" in found.reason
 
 
@@ -216,7 +216,7 @@ def test_two_that_contradict_each_other_are_undecided() -> None:
     _, model, world = exact(2, seed=19)
     model[1] = random_poses(1, 20)[0]
     found = align_to_map(model, world, depth_ratios=[1.0, 1.01, 0.99])
-    assert found.num_inliers == 1
+    assert found.num_consistent == 1
     assert found.num_rivals == 1
     assert np.isinf([found.scale_std, found.rotation_std_deg]).all()
     assert "undecided" in found.reason
@@ -243,7 +243,7 @@ def test_two_camps_of_orientations_at_one_place_are_undecided() -> None:
     model[:3] = random_sim3(36).inverse().apply_to_pose(world[:3])
     model[:, :3, 3] = 0.0
     found = align_to_map(model, world)
-    assert found.inliers.tolist() in ([True] * 3 + [False] * 3, [False] * 3 + [True] * 3)
+    assert found.consistent.tolist() in ([True] * 3 + [False] * 3, [False] * 3 + [True] * 3)
     assert np.isinf(found.rotation_std_deg)
     assert "undecided" in found.reason
 
@@ -252,14 +252,14 @@ def test_weights_decide_and_zero_leaves_out() -> None:
     expected, model, world = exact(6, seed=23)
     other = random_sim3(24)
     model[:3] = other.inverse().apply_to_pose(world[:3])
-    for weights, answer, inliers in (
+    for weights, answer, consistent in (
         ([1, 1, 1, 3, 3, 3], expected, [3, 4, 5]),
         ([3, 3, 3, 1, 1, 1], other, [0, 1, 2]),
         ([1, 1, 1, 0, 1, 0], other, [0, 1, 2]),
     ):
         found = align_to_map(model, world, weights=weights)
         assert_same_sim3(found.world_from_model, answer)
-        np.testing.assert_array_equal(np.flatnonzero(found.inliers), inliers)
+        np.testing.assert_array_equal(np.flatnonzero(found.consistent), consistent)
         assert found.scale_known
 
 
@@ -395,7 +395,7 @@ def measure(case: Case, trials: int = 100) -> tuple[np.ndarray, np.ndarray, np.n
         found = align_to_map(trial.model_from_cams, trial.world_from_cams, depth_ratios=trial.depth_ratios)
         pose, covariance = query_pose(found, trial.model_from_query)
         degrees, meters = geometry.pose_error(pose, trial.world_from_query)
-        alike = np.array_equal(found.inliers, ~trial.wrong)
+        alike = np.array_equal(found.consistent, ~trial.wrong)
         rows.append((degrees, meters, is_trustworthy(found, covariance), not found.scale_known, alike))
     table = np.array(rows, np.float64)
     return table[:, :2], table[:, 2] > 0, table[:, 3] > 0, table[:, 4] > 0

@@ -26,8 +26,7 @@ def network(**settings: Any) -> Any:
     )
 
 
-@pytest.fixture(scope="module")
-def state() -> State:
+def random_state() -> State:
     """Random weights of the official names and shapes that match alike descriptors."""
     generator = torch.Generator().manual_seed(0)
     with torch.device("meta"):
@@ -47,6 +46,11 @@ def state() -> State:
     made["match_assignment_layers.8.final_projection.weight"] = 10 * torch.eye(256)
     made["match_assignment_layers.8.matchability.bias"] += 4
     return made
+
+
+@pytest.fixture(scope="module")
+def state() -> State:
+    return random_state()
 
 
 @pytest.fixture(scope="module")

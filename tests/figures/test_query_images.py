@@ -104,12 +104,12 @@ def images(tmp_path):
     Image.fromarray(rng.integers(0, 255, (96, 64, 3), np.uint8)).save(files[1])
     points = rng.uniform([-1, -1, 3], [1, 1, 6], (5, 3))
     pixels, _ = project(points, CAMERA, np.eye(4))
-    inlier, matches = np.array([True, True, False, True, True]), np.array([4, 7, 1, 2, 9])
+    agrees, matches = np.array([True, True, False, True, True]), np.array([4, 7, 1, 2, 9])
     true = make_pose(np.eye(3), [0.02, 0, 0])
     kinds = np.array(["sift/guided"] * 5)
-    query = ShownImage("q", files[0], CAMERA, np.eye(4), pixels, points, matches, inlier, true, kinds)
+    query = ShownImage("q", files[0], CAMERA, np.eye(4), pixels, points, matches, agrees, true, kinds)
     seen = [4, 0, 2]
-    seen_too = points[seen], matches[seen], inlier[seen], true, kinds[seen]
+    seen_too = points[seen], matches[seen], agrees[seen], true, kinds[seen]
     reference = ShownImage("r", files[1], HIGH, np.eye(4), pixels[:3], *seen_too)
     return query, reference
 

@@ -12,8 +12,8 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.errors import ArtifactError
 from toolkit.evaluate import evaluate_scene
-from toolkit.figures.sequences import SequencePair, draw_sequence, draw_steps
-from toolkit.files import pair_name, write_sidecar
+from toolkit.figures.sequences import SequencePair, draw_sequence, draw_steps, warn_of_older
+from toolkit.files import pair_name, why_older, write_sidecar
 from toolkit.sequence import sequence_pairs
 
 pytest.importorskip("gtsam")
@@ -64,7 +64,9 @@ def test_which_queries_were_rescued_and_broken(pair: SequencePair) -> None:
     np.testing.assert_allclose(changes[["single_translation_error_m", "translation_error_m"]], [[0.05, 2], [2, 0.05]])
 
 
-def test_results_from_other_single_poses_or_damaged_ones_are_not_used(pair: SequencePair) -> None:
+def test_results_from_other_single_poses_or_damaged_ones_are_not_used(
+    pair: SequencePair, caplog: pytest.LogCaptureFixture
+) -> None:
     single, sequence, steps = (Path(f"{pair.stem}{end}") for end in (".txt", "_sequence.txt", "_sequence_steps.csv"))
     write_sidecar(sequence, {}, [steps], made_from=[single])
     found = SequencePair.find(pair.stem.parent, "A", "ios", "hl")
@@ -72,8 +74,15 @@ def test_results_from_other_single_poses_or_damaged_ones_are_not_used(pair: Sequ
     steps.write_text(steps.read_text().rpartition("\n")[0])
     with pytest.raises(ArtifactError, match=r"_sequence_steps\.csv is damaged"):
         found.steps  # noqa: B018
+    other = sequence.with_name(sequence.name.replace("query_hl", "query_spot"))
+    other.write_text(sequence.read_text())
+    write_sidecar(other, {}, made_from=[single])
+    warn_of_older(single.parent)
+    assert not caplog.text
     Trajectory.from_poses(np.arange(1), ["a"], at(7)).write(single)
     assert SequencePair.find(pair.stem.parent, "A", "ios", "hl") is None
+    warn_of_older(single.parent)
+    assert caplog.messages == [f"Sequences of 2 pairs are not used: {why_older(sequence, 'sequence')}"]
 
 
 def sequence_of(place: Path, folder: Path, **settings: object) -> None:

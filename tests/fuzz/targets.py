@@ -174,7 +174,7 @@ def check_table(name: str, content: bytes) -> None:
 
 HDF5_NAMES = ("10/rig", "20/rig")
 HDF5_ARRAYS = (
-    "camera", "pixels", "points", "point_index", "inlier", "found_by", "found_by_labels", "view_of", "view_reference",
+    "camera", "pixels", "points", "point_index", "agrees", "found_by", "found_by_labels", "view_of", "view_reference",
     "view_pixels", "images", "references", "rejected", "keypoints", "scales", "scores", "descriptors", "image_size",
 )  # fmt: skip
 
@@ -301,7 +301,7 @@ def check_query(query: QueryResult) -> None:
     count, views = len(found.camera), len(found.view_of)
     assert found.pixels.shape == (count, 2)
     assert found.points.shape == (count, 3)
-    assert all(len(column) == count for column in (found.point_index, found.inlier, found.found_by))
+    assert all(len(column) == count for column in (found.point_index, found.agrees, found.found_by))
     assert found.view_pixels.shape == (views, 2)
     assert len(found.view_reference) == views
     assert all(isinstance(name, str) for name in (*query.images, *query.references, *query.rejected))

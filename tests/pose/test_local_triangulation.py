@@ -143,7 +143,7 @@ def test_wrong_matches_make_no_points() -> None:
     estimate = scene.localizer(wrong=0.33).localize(scene.query, scene.references)
     assert_right(estimate, 0.02)
     used = estimate.correspondences
-    distances = np.linalg.norm(scene.points - used.points[used.inlier][:, None], axis=2).min(axis=1)
+    distances = np.linalg.norm(scene.points - used.points[used.agrees][:, None], axis=2).min(axis=1)
     assert np.mean(distances < 0.05) > 0.95
 
 

@@ -209,7 +209,7 @@ def test_a_wrong_focal_length_is_doubted_and_its_deviation_is_honest(room: World
     assert estimate.world_from_rig is not None
     error_m = float(geometry.pose_error(estimate.world_from_rig, QUERY)[1])
     assert error_m > 0.1
-    assert estimate.position_std_m == pytest.approx(error_m, rel=0.2)
+    assert estimate.position_std == pytest.approx(error_m, rel=0.2)
 
 
 RIG_FROM_CAMS = np.stack(
@@ -284,7 +284,7 @@ def test_no_references(room: World) -> None:
     assert estimate.world_from_rig is None
     assert estimate.covariance is None
     assert (estimate.num_matches, estimate.num_inliers, estimate.inlier_ratio) == (0, 0, 0.0)
-    assert np.isnan([estimate.position_std_m, estimate.rotation_std_deg]).all()
+    assert np.isnan([estimate.position_std, estimate.rotation_std_deg]).all()
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
@@ -581,7 +581,7 @@ def test_covariance_is_the_scatter_of_the_poses(rig: bool, map_noise_px: float) 
     spread = np.sqrt(np.linalg.eigvalsh(whiten @ scatter @ whiten.T))
     assert 0.6 < spread.min() < spread.max() < 1.5
     # And the summary that people read.
-    assert estimate.position_std_m == pytest.approx(np.sqrt(np.trace(estimate.covariance[3:, 3:])))
+    assert estimate.position_std == pytest.approx(np.sqrt(np.trace(estimate.covariance[3:, 3:])))
     assert estimate.rotation_std_deg == pytest.approx(np.degrees(np.sqrt(np.trace(estimate.covariance[:3, :3]))))
 
 
@@ -592,7 +592,7 @@ def test_guided_matches_alone_count_less(room: World, monkeypatch: pytest.Monkey
     for known_to_descriptors in (1536, 100):
         monkeypatch.setattr(matches, "MAX_QUERY_FEATURES", known_to_descriptors)
         found = ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES])
-        stds.append(found.position_std_m)
+        stds.append(found.position_std)
         guided.append(found.num_guided)
     assert guided[1] > 0.9 * guided[0] > 150
     assert 1.1 * stds[0] < stds[1] < np.sqrt(1 / GUIDED_WEIGHT) * 1.1 * stds[0]
@@ -605,7 +605,7 @@ def test_a_point_that_is_not_known_well_tells_less(room: World) -> None:
     def std(noise_px: float) -> float:
         local_map = replace(room.local_map, noise_px=np.full(len(room.points), noise_px, np.float32))
         localizer = PnpLocalizer([MappedFeatures(local_map, room.features)])
-        return ask(localizer, [PINHOLE], np.eye(4)[None], [seen], [REFERENCES]).position_std_m
+        return ask(localizer, [PINHOLE], np.eye(4)[None], [seen], [REFERENCES]).position_std
 
     exact, noisy, hopeless, worse = std(0), std(2), std(1e3), std(1e6)
     assert 1.2 * exact < noisy < hopeless
@@ -632,7 +632,7 @@ def test_more_noise_is_more_uncertainty(room: World) -> None:
     stds = []
     for noise in (0.2, 0.8):
         seen = room.look(PINHOLE, QUERY, noise_px=noise)
-        stds.append(ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES]).position_std_m)
+        stds.append(ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES]).position_std)
     assert 2 < stds[1] / stds[0] < 6
 
 
@@ -708,13 +708,13 @@ def test_inliers_are_what_the_pose_agrees_with_and_the_rest_is_rejected(room: Wo
     matches = estimate.correspondences
     errors = errors_deg(room.points, estimate, *asked[:2])
     # The pose is refined once more on its guided matches, which moves some of them a little beyond the limit.
-    assert (errors[matches.inlier] < 1.2 * localizer.settings.max_error_deg).all()
-    assert (errors[~matches.inlier] >= localizer.settings.max_error_deg).all()
-    assert (~matches.inlier).sum() > 100
+    assert (errors[matches.agrees] < 1.2 * localizer.settings.max_error_deg).all()
+    assert (errors[~matches.agrees] >= localizer.settings.max_error_deg).all()
+    assert (~matches.agrees).sum() > 100
     guided = np.char.endswith(matches.found_by, "/guided")
     assert set(matches.found_by) == {"sift/guided", "sift/descriptors"}
     assert guided.sum() == estimate.num_guided
-    assert matches.inlier[guided].all()
+    assert matches.agrees[guided].all()
     # Each match is there once: those that descriptors found too are among the guided ones.
     rows = np.column_stack([matches.camera, matches.pixels, matches.point_index])
     assert len(np.unique(rows, axis=0)) == len(rows)
@@ -760,7 +760,7 @@ def test_without_a_pose_all_matches_are_rejected(room: World) -> None:
     assert estimate.status_text == "failed: too few matches"
     for rejected in (matches, estimate.correspondences):
         assert len(rejected)
-        assert not rejected.inlier.any()
+        assert not rejected.agrees.any()
         assert set(rejected.found_by) == {"sift/descriptors"}
         assert len(rejected.view_of) == 0
 
@@ -772,7 +772,7 @@ def test_images_without_features_are_left_out_and_the_others_keep_their_numbers(
     assert set(estimate.correspondences.camera) == {1, 2}
     assert estimate.remark == "torn"
     errors = errors_deg(room.points, estimate, cameras, poses)
-    assert (errors[estimate.correspondences.inlier] < 1.2 * room.localizer().settings.max_error_deg).all()
+    assert (errors[estimate.correspondences.agrees] < 1.2 * room.localizer().settings.max_error_deg).all()
     none = ask(room.localizer(), cameras, poses, ["torn", "no features", "torn"], references)
     assert none.status_text == "failed: no readable image (torn; no features; torn)"
     assert none.world_from_rig is None

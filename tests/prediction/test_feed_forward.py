@@ -30,6 +30,7 @@ from toolkit.prediction.feed_forward import (
     QueryPrediction,
 )
 from toolkit.prediction.interface import Prediction
+from toolkit.prediction.network import _warn_of_simulation
 from toolkit.prediction.simulated import SimulatedPredictor
 from toolkit.store.items import Items
 
@@ -77,7 +78,7 @@ def test_the_covariance_is_that_of_the_rig(world: World) -> None:
     )
     assert np.isclose(far.estimate.rotation_std_deg, near.estimate.rotation_std_deg)
     arm_m = 10 * np.radians(near.estimate.rotation_std_deg) * np.sqrt(2 / 3)
-    assert abs(far.estimate.position_std_m / np.hypot(arm_m, near.estimate.position_std_m) - 1) < 0.2
+    assert abs(far.estimate.position_std / np.hypot(arm_m, near.estimate.position_std) - 1) < 0.2
 
 
 class Refocused(SimulatedPredictor):
@@ -158,7 +159,7 @@ def test_an_unknown_scale_is_never_ok(world: World) -> None:
         for answer, error in zip(answers, rotation_deg, strict=True):
             assert answer.estimate.status == "low_confidence"
             assert np.isinf(answer.estimate.scale_std)
-            assert np.isinf(answer.estimate.position_std_m)
+            assert np.isinf(answer.estimate.position_std)
             assert error < 3
             assert np.linalg.norm(answer.estimate.world_from_rig[:3, 3] - places[0, :3, 3]) < 2
         assert answers[0].estimate.remark
@@ -343,9 +344,11 @@ def test_rows_say_that_they_are_simulated(finished: SceneFiles, small_capture: P
 def test_the_log_says_that_it_is_simulated(
     run: SceneFiles, small_capture: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    _warn_of_simulation.cache_clear()
     with caplog.at_level(logging.WARNING):
         run_stage(small_capture, run, query_device="ios")
-    assert "simulated looks up the true poses" in caplog.text
+        run_stage(small_capture, run, query_device="ios", skip_existing=False)
+    assert caplog.text.count("simulated looks up the true poses") == 1
 
 
 @pytest.mark.parametrize("method", ["feed_forward", "hybrid"])
@@ -456,6 +459,13 @@ def test_a_prediction_is_drawn_and_labeled(world: World, tmp_path: Path) -> None
     figure = draw_prediction(localizer, queries[0][0], answer)
     assert save_figure(figure, tmp_path / "prediction.png").stat().st_size > 20_000
     assert figure.get_suptitle().startswith("SIMULATED, no result")
+    localizer.unit = "L", 0.5
+    in_lengths = draw_prediction(localizer, queries[0][0], answer)
+    assert [figure.axes[0].get_xlabel()[-3:], in_lengths.axes[0].get_xlabel()[-3:]] == ["[m]", "[L]"]
+    depths = [[axis.get_title() for axis in one.axes if "depth" in axis.get_title()] for one in (figure, in_lengths)]
+    assert depths[0][0].endswith(" m")
+    assert depths[1][0].endswith(" L")
+    np.testing.assert_allclose(float(depths[1][0].split()[1]), 2 * float(depths[0][0].split()[1]), atol=0.2)
     failed = FeedForwardAnswer(QueryResult.failed("no references"), ())
     assert "failed: no references" in draw_prediction(localizer, queries[0][0], failed).get_suptitle()
     undecided = replace(answer.cameras[0], reason="undecided")

@@ -114,9 +114,9 @@ def test_depth_maps_localize_where_nothing_is_triangulated(world: World, index: 
     rotation_deg, distance_m = world.error(index, found)
     assert rotation_deg < 0.3
     assert distance_m < 0.03
-    assert distance_m < 5 * found.position_std_m, "the uncertainty tells"
+    assert distance_m < 5 * found.position_std, "the uncertainty tells"
     matches = found.correspondences
-    assert matches.inlier.any()
+    assert matches.agrees.any()
     assert (matches.point_index == -1).all()
     assert (matches.found_by == "sift/lifted").all()
 
@@ -130,7 +130,7 @@ def test_predicted_depth_localizes_without_depth_maps(world: World, index: int) 
     rotation_deg, distance_m = world.error(index, found)
     assert rotation_deg < 1
     assert distance_m < 0.1
-    assert distance_m < 5 * found.position_std_m, "the uncertainty tells"
+    assert distance_m < 5 * found.position_std, "the uncertainty tells"
 
 
 class WrongDepth:
@@ -185,7 +185,7 @@ def test_a_wrong_scale_of_one_image_is_in_the_covariance(world: World) -> None:
     assert found is not None
     if found.world_from_rig is not None:
         arm = np.linalg.norm(world.map.world_from_cams[far, :3, 3] - found.world_from_rig[:3, 3])
-        assert found.position_std_m > 0.09 * arm
+        assert found.position_std > 0.09 * arm
 
 
 def test_without_depth_nothing_is_lifted(world: World) -> None:

@@ -15,7 +15,7 @@ from toolkit.geometry import make_pose
 from toolkit.mapping.local_map import LocalMap
 from toolkit.results import localized as images
 from toolkit.results import pair as localized
-from toolkit.results.localized import LocalizedPair, sure_points
+from toolkit.results.localized import LocalizedPair, support_of, sure_points
 from toolkit.results.pair import load_maps, map_files
 
 INLIERS = [True, False, True, True, False, True]
@@ -60,14 +60,14 @@ def test_a_single_camera_shows_its_inliers_and_where_its_references_see_them(cap
     (camera,) = details.cameras
     np.testing.assert_array_equal(camera.pixels, found.pixels)
     np.testing.assert_allclose(camera.points, found.points)
-    assert camera.inlier.tolist() == INLIERS
+    assert camera.agrees.tolist() == INLIERS
     assert [image.name for image in details.references] == list(query.references)
     second = details.references[1]
     assert second.matches.tolist() == [0, 2, 4]
     np.testing.assert_array_equal(second.pixels, found.view_pixels[found.view_reference == 1])
     figure = draw_localization(details)
     rejected, _ = drawn(figure.axes[0])
-    np.testing.assert_allclose(rejected, found.pixels[~found.inlier])
+    np.testing.assert_allclose(rejected, found.pixels[~found.agrees])
     assert figure.axes[0].get_title() == "query: 4 of 6 map points agree"
     titles = [axis.get_title() for axis in figure.axes[1:]]
     assert titles == ["reference 1: sees 4 points", "reference 2: sees 2 points"]
@@ -106,7 +106,10 @@ def test_errors_are_those_of_the_device_as_in_the_evaluation(capture, open_pair)
 def test_a_network_shows_consistent_and_rejected_references_and_claims_no_matches(capture, open_pair):
     images = names(capture["ios_map"], 4)
     query = stored(query_images(capture, "ios"), images[:2], images[2:])
-    details = open_pair("ios", query, method="vggt:simulated/vggt", num_inliers=2).details(0)
+    method = "hybrid:simulated/feed_forward"
+    pair = open_pair("ios", query, method=method, num_inliers=0, references=";".join(images[:2]))
+    details = pair.details(0)
+    assert support_of(pair.localizations.errors.iloc[0]) == "2 consistent references"
     assert [image.name for image in details.references] == images[:2]
     assert [image.name for image in details.rejected] == images[2:]
     figure = draw_localization(details)

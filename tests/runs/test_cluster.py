@@ -1,5 +1,6 @@
 """Work done by the workers of a cluster: the same results as of one process, whatever becomes of a worker."""
 
+import logging
 import os
 import pickle
 import shutil
@@ -341,8 +342,9 @@ def failing_share(path: Path) -> None:
 
 @pytest.mark.slow
 def test_local_workers_have_the_settings_and_the_folder_of_who_asks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
     said: list[str] = []
     monkeypatch.setenv(ALLOW_OUTSIDE, "1")
     monkeypatch.chdir(tmp_path)
@@ -359,7 +361,9 @@ def test_local_workers_have_the_settings_and_the_folder_of_who_asks(
         with pytest.raises(DamagedError) as caught:  # a stage heals what it names
             cluster.run(failing_share, [(tmp_path / "a.h5",)], [1], "fail", "file")
         assert caught.value.path == tmp_path / "a.h5"
+        logging.getLogger("distributed.nanny").warning("Worker process still alive after 4.0 seconds, killing")
     assert current_cluster() is None
+    assert not [one for one in caplog.records if one.name.startswith("distributed") and one.levelno < logging.ERROR]
 
 
 def deadly_share() -> None:

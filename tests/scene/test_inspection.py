@@ -77,7 +77,7 @@ def test_it_shows_what_the_stage_stored(files: SceneFiles, pair: InspectedPair) 
     stored = pair.localized.results[1]
     assert one.result.status_text == row["status"]
     assert one.numbers["num_inliers"] == row["num_inliers"]
-    assert one.matches["agree"].sum() == stored.correspondences.inlier.sum() > 0
+    assert one.matches["agree"].sum() == stored.correspondences.agrees.sum() > 0
     assert one.matches.to_numpy().sum() == len(stored.correspondences)
     off = invert(one.result.world_from_rig) @ one.true_pose
     assert one.error[1] == pytest.approx(np.linalg.norm(off[:3, 3])), "of the rig"
@@ -258,6 +258,12 @@ def test_an_estimate_in_doubt_says_why() -> None:
     contradicted = replace(unsure, reason=CAMERA, remark="the focal length is 500 px")
     camera = reason_in_words(contradicted, numbers, LocalizeSettings())
     assert camera.endswith("The focal length is 500 px.")
+
+
+def test_a_predicted_pose_says_how_many_references_agree() -> None:
+    named = {"references": ("a", "b"), "rejected": ("c",), "found_by": "feed_forward:simulated/feed_forward"}
+    predicted = QueryResult(Status.OK, **named)  # type: ignore[arg-type]
+    assert reason_in_words(predicted, {}, LocalizeSettings()) == "2 of 3 references agree on the pose."
 
 
 def test_a_list_chooses_what_is_shown(pair: InspectedPair, monkeypatch: pytest.MonkeyPatch) -> None:

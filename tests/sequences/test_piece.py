@@ -33,7 +33,7 @@ def test_what_failed_or_contradicts_is_asked_again_and_then_counts() -> None:
         for frame, about in todo:
             rotation_deg, distance_m = geometry.pose_error(about.world_from_rig, way.world_from_rig[frame])
             assert rotation_deg < 4 * about.rotation_std_deg
-            assert distance_m < 4 * about.position_std_m
+            assert distance_m < 4 * about.position_std
         return [answer(way, frame) for frame, _ in todo]
 
     before = localize_piece(way.odometry, way.queries, asked, SETTINGS)

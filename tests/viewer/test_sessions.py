@@ -293,10 +293,10 @@ def test_a_localization_view_holds_the_queries(capture, tmp_path, monkeypatch):
     queries = Localizations(list("abcd"), table, estimated, true, references)
     points = rng.uniform([-0.3, -0.3, 2], [0.3, 0.3, 4], (6, 3))
     pixels = rng.uniform(0, 90, (6, 2))
-    inlier = np.arange(6) < 5
+    agrees = np.arange(6) < 5
     placed = points + estimated[1, :3, 3]
-    shown = ShownImage("b.jpg", file, camera, estimated[1], pixels, placed, np.arange(6), inlier, true[1])
-    reference = ShownImage("r.jpg", file, camera, map_poses[0], pixels[:2], placed[:2], np.arange(2), inlier[:2])
+    shown = ShownImage("b.jpg", file, camera, estimated[1], pixels, placed, np.arange(6), agrees, true[1])
+    reference = ShownImage("r.jpg", file, camera, map_poses[0], pixels[:2], placed[:2], np.arange(2), agrees[:2])
     lost = ShownImage("c.jpg", file, camera, np.full((4, 4), np.nan))
     details = [(1, QueryDetails([shown], [reference])), (2, QueryDetails([lost], [reference]))]
     path = record_localizations(tmp_path / "v.rrd", "view", map_poses, points, None, queries, iter(details))

@@ -98,14 +98,14 @@ class DepthRatios:
         """Whether the reference of each ratio is known."""
         return len(self.reference) > 0 and bool(self.reference[0] >= 0)
 
-    def estimate(self, inliers: Bools | None) -> ScaleEstimate | None:
+    def estimate(self, consistent: Bools | None) -> ScaleEstimate | None:
         """Return the scale from the samples of some references, (M,) bool, or of all; None without samples.
 
         Expectation maximization fits a mixture of noise around one value and uniformly distributed wrong samples. It
         starts from the middle of the shortest interval that contains half of the samples (Rousseeuw 1984). The error
         that the samples of one reference share is estimated by moments (DerSimonian and Laird 1986).
         """
-        kept = inliers[self.reference] if self.grouped and inliers is not None else np.ones(len(self.log), bool)
+        kept = consistent[self.reference] if self.grouped and consistent is not None else np.ones(len(self.log), bool)
         log, reference = self.log[kept], self.reference[kept]
         if not len(log):
             return None

@@ -109,8 +109,8 @@ class PoseMean:
     covariance: Floats
     """(6, 6) of d in world_from_cam @ Exp(d): rotation in radians, then translation in meters, in the camera frame.
     Infinite on the diagonal if as many hypotheses agree on another pose."""
-    inliers: Bools
-    """(H,)"""
+    consistent: Bools
+    """(H,) hypotheses that agree with the mean."""
     reason: str
     """What was left out or is unknown; may be empty."""
 
@@ -135,19 +135,19 @@ def robust_mean_pose(world_from_cams: ArrayLike, covariances: ArrayLike) -> Pose
     information = _information(covariances, len(poses))
     notes = [] if finite.all() else [f"hypotheses {listed(~finite)} left out: not finite"]
     pose, covariance, inside = _mean(poses[usable], information[usable])
-    inliers, left_out = np.zeros(len(poses), bool), np.zeros(len(poses), bool)
-    inliers[usable], left_out[usable] = inside, ~inside
+    consistent, left_out = np.zeros(len(poses), bool), np.zeros(len(poses), bool)
+    consistent[usable], left_out[usable] = inside, ~inside
     if left_out.any():
         notes.append(f"hypotheses {listed(left_out)} left out: far from the others")
         rivals = int(_mean(poses[left_out], information[left_out])[2].sum())
         if rivals > 0.9 * inside.sum():
             notes.append(f"{int(inside.sum())} hypotheses agree, and {rivals} others elsewhere: undecided")
             covariance = np.diag(np.full(6, np.inf))
-    return PoseMean(pose, covariance, inliers, "; ".join(notes))
+    return PoseMean(pose, covariance, consistent, "; ".join(notes))
 
 
 def _mean(poses: Floats, information: Floats) -> tuple[Floats, Floats, Bools]:
-    """Return the mean (4, 4) of poses (H, 4, 4), its covariance (6, 6) and which hypotheses are inliers (H,)."""
+    """Return the mean (4, 4) of poses (H, 4, 4), its covariance (6, 6) and which hypotheses agree (H,)."""
 
     def distances(errors: Floats) -> Floats:
         """Return distances (H,) in standard deviations per axis of errors (H, 6)."""

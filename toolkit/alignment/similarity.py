@@ -38,8 +38,8 @@ OUTLIER_SHARE = 0.2  # expected share of wrong references
 WRONG_PLACE = 20.0  # least extent of the space of wrong centers, in multiples of the expected noise
 CENTER_NOISE_SHARE = 0.01  # noise over the typical distance of references: larger scenes are predicted less exactly
 MAX_POSITION_STD_M, MAX_ROTATION_STD_DEG = 0.2, 2.25  # of a pose that is `ok`: root of the trace of the covariance
-MIN_INLIERS = 2  # consistent references of a pose that is `ok`; nothing checks a single one
-MAX_RIVAL_SHARE = 0.5  # size of the largest other group of references that agree, over the number of inliers
+MIN_CONSISTENT = 2  # consistent references of a pose that is `ok`; nothing checks a single one
+MAX_RIVAL_SHARE = 0.5  # size of the largest other group of references that agree, over that of consistent ones
 MAX_SCALE_STD = 0.2  # a scale with a larger relative standard deviation counts as unknown
 _STARTS = 6  # number of best hypotheses that are refined
 _ROUNDS = 10
@@ -89,21 +89,22 @@ class Alignment:
 
     world_from_model: Sim3
     """If the scale is unknown, `scale` is the most likely one, positive and finite, but not a measurement. The
-    centroids of the inliers coincide in any case."""
-    inliers: Bools
-    """(M,) references whose predicted relative poses agree with the map."""
+    centroids of the consistent references coincide in any case."""
+    consistent: Bools
+    """(M,) references whose predicted relative poses agree with the map. An inlier is a match, see `QueryResult`."""
     scale_std: float
     """Relative standard deviation of the scale; inf if unknown."""
     rotation_std_deg: float
     """Standard deviation of the rotation; inf if unknown."""
     rmse_m: float
-    """Root mean square distance of the inliers' centers after alignment; NaN without inliers."""
+    """Root mean square distance of the consistent references' centers after alignment; NaN without any."""
     reason: str
     """What was left out or is unknown, and why; may be empty."""
     num_rivals: int
     """Largest number of excluded references that agree with each other on another alignment; 1 if none agree."""
     centroid_m: Floats
-    """(3,) weighted centroid of the inliers in the world; rotation about it, scale and translation are uncorrelated."""
+    """(3,) weighted centroid of the consistent references in the world; rotation about it, scale and translation are
+    uncorrelated."""
     rotation_covariance: Floats
     """(3, 3) of a small rotation in the world frame, radians."""
     centroid_covariance: Floats
@@ -118,8 +119,8 @@ class Alignment:
         return bool(np.isfinite(self.scale_std))
 
     @property
-    def num_inliers(self) -> int:
-        return int(self.inliers.sum())
+    def num_consistent(self) -> int:
+        return int(self.consistent.sum())
 
 
 @fixed_sums
@@ -185,23 +186,23 @@ def align_to_map(
     )
     depth = ratios.estimate(None)
     best = problem.search(depth)
-    inliers, excluded = np.zeros(len(model), bool), np.zeros(len(model), bool)
-    inliers[usable], excluded[usable] = best.inliers, ~best.inliers
+    consistent, excluded = np.zeros(len(model), bool), np.zeros(len(model), bool)
+    consistent[usable], excluded[usable] = best.consistent, ~best.consistent
     num_rivals, undecided = 0, []
     if excluded.any():
         notes.append(f"references {listed(excluded)} left out: their poses contradict the others'")
-        rest = problem.subset(~best.inliers)
-        # Excluded references agree with each other only within twice the noise of the inliers.
+        rest = problem.subset(~best.consistent)
+        # Excluded references agree with each other only within twice the noise of the others.
         noise = best.state.with_noise(2.0)
         rival = rest.search(depth, (float(noise.rotation_noise[0]), float(noise.center_noise[0])))
-        num_rivals = int(rival.inliers.sum())
-        if rest.weight[rival.inliers].sum() > 0.9 * problem.weight[best.inliers].sum():
-            counts = f"{inliers.sum()} references agree, and {num_rivals} others on another alignment"
+        num_rivals = int(rival.consistent.sum())
+        if rest.weight[rival.consistent].sum() > 0.9 * problem.weight[best.consistent].sum():
+            counts = f"{consistent.sum()} references agree, and {num_rivals} others on another alignment"
             undecided = [f"{counts}: undecided"]
         if ratios.grouped:
-            depth = ratios.estimate(inliers)
+            depth = ratios.estimate(consistent)
     notes += ratios.notes
-    alignment = replace(problem.solve(best, depth, notes), inliers=inliers, num_rivals=num_rivals)
+    alignment = replace(problem.solve(best, depth, notes), consistent=consistent, num_rivals=num_rivals)
     if undecided:
         alignment = replace(alignment, reason="; ".join([*notes, *undecided]), **_UNKNOWN)
     return alignment
@@ -255,8 +256,8 @@ def is_trustworthy(alignment: Alignment, covariance: Floats) -> bool:
     rivals = alignment.num_rivals if alignment.num_rivals > 1 else 0
     return bool(
         alignment.scale_known
-        and alignment.num_inliers >= MIN_INLIERS
-        and rivals <= MAX_RIVAL_SHARE * alignment.num_inliers
+        and alignment.num_consistent >= MIN_CONSISTENT
+        and rivals <= MAX_RIVAL_SHARE * alignment.num_consistent
         and np.sqrt(np.trace(covariance[3:, 3:])) <= MAX_POSITION_STD_M
         and np.degrees(np.sqrt(np.trace(covariance[:3, :3]))) <= MAX_ROTATION_STD_DEG
     )
@@ -293,7 +294,7 @@ class _Problem:
         return _Problem(self.model[kept], self.world[kept], self.weight[kept], *self.expected)
 
     def search(self, depth: ScaleEstimate | None, noise: tuple[float, float] | None = None) -> _Candidate:
-        """Return the most likely similarity and its inliers; `noise` (rotation, center) fixes the noise per axis."""
+        """Return the most likely similarity; `noise` (rotation, center) fixes the noise per axis."""
         alone, (first, second) = np.eye(len(self.m)), np.triu_indices(len(self.m), 1)
         members = np.vstack([alone[first] + alone[second], alone])
         state = self.fit(members, self.opening(members), None)
@@ -317,10 +318,10 @@ class _Problem:
             best = int(np.argmax(scores))
             if np.abs(members[best] - before[best]).max() < 1e-3:
                 break
-        inliers = members[best] > 0.5
-        if not inliers.any():
-            inliers[np.argmax(members[best])] = True
-        return _Candidate(state[best : best + 1], np.where(inliers, np.maximum(members[best], 0.5), 0.0), inliers)
+        consistent = members[best] > 0.5
+        if not consistent.any():
+            consistent[np.argmax(members[best])] = True
+        return _Candidate(state[best : best + 1], np.where(consistent, np.maximum(members[best], 0.5), 0.0), consistent)
 
     def opening(self, members: Floats) -> _Similarities:
         """Return starting points for the fit of members (K, M): their mean rotations, and the expected noise."""
@@ -397,7 +398,7 @@ class _Problem:
         return likelihood, np.exp(right - either)
 
     def solve(self, best: _Candidate, depth: ScaleEstimate | None, notes: list[str]) -> Alignment:
-        """Return the weighted least squares alignment of a candidate's inliers, with its uncertainty."""
+        """Return the weighted least squares alignment of a candidate's consistent references, with its uncertainty."""
         state, share = best.state, best.members * self.weight
         rotation, scale = state.rotation[0], float(state.scale[0])
         rotation_noise, center_noise = float(state.rotation_noise[0]), float(state.center_noise[0])
@@ -442,10 +443,10 @@ class _Problem:
         squared_m2 = ((c - scale * m @ rotation.T) ** 2).sum(axis=1)
         return Alignment(
             world_from_model=Sim3(scale, rotation, translation),
-            inliers=best.inliers,
+            consistent=best.consistent,
             scale_std=scale_std if known else np.inf,
             rotation_std_deg=float(np.degrees(np.sqrt(np.trace(covariance)))),
-            rmse_m=float(np.sqrt(squared_m2[best.inliers].mean())),
+            rmse_m=float(np.sqrt(squared_m2[best.consistent].mean())),
             reason="; ".join(notes),
             num_rivals=0,
             centroid_m=self.origin_c + c0,
@@ -489,12 +490,12 @@ class _Similarities:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """One similarity and its inliers."""
+    """One similarity and the references that are consistent with it."""
 
     state: _Similarities
     members: Floats
     """(M,) probability that each reference is correct, 0 if left out."""
-    inliers: Bools
+    consistent: Bools
 
 
 def _middle(points: Floats) -> Floats:

@@ -98,7 +98,7 @@ def combine(priors: Sequence[Masks]) -> tuple[Masks, list[int]]:
     return Masks(priors[0].count, bits, np.where(limited[which], which, -1)), without
 
 
-def near(world_from_cams: Floats, world_from_cam: Floats, distance_m: float, angle_deg: float = 180.0) -> Bools:
+def near(world_from_cams: Floats, world_from_cam: Floats, distance: float, angle_deg: float = 180.0) -> Bools:
     """Return which of N map cameras may see the same scene as a camera at a roughly known pose, (N,) bool.
 
     Roll about the viewing direction is ignored, because it only rotates the image.
@@ -106,10 +106,10 @@ def near(world_from_cams: Floats, world_from_cam: Floats, distance_m: float, ang
     Args:
         world_from_cams: (N, 4, 4) poses of the map cameras, OpenCV axes; a NaN pose is not near.
         world_from_cam: (4, 4) pose of the query, in the map's frame.
-        distance_m: largest distance between the camera centers, in the unit of the poses.
+        distance: largest distance between the camera centers, in the unit of the poses.
         angle_deg: largest angle between the viewing directions (z axes).
     """
-    is_near = np.linalg.norm(world_from_cams[:, :3, 3] - world_from_cam[:3, 3], axis=1) <= distance_m
+    is_near = np.linalg.norm(world_from_cams[:, :3, 3] - world_from_cam[:3, 3], axis=1) <= distance
     forward = world_from_cams[is_near, :3, 2], world_from_cam[:3, 2]
     # atan2 is exact near 0 and 180 degrees, where the arccos of rounded numbers is not.
     sine, cosine = np.linalg.norm(np.cross(*forward), axis=1), forward[0] @ forward[1]
@@ -118,7 +118,7 @@ def near(world_from_cams: Floats, world_from_cam: Floats, distance_m: float, ang
 
 
 def pose_masks(
-    poses: Trajectory, map_images: Images, query_images: Images, distance_m: float, angle_deg: float
+    poses: Trajectory, map_images: Images, query_images: Images, distance: float, angle_deg: float
 ) -> Masks:
     """Return masks of the map images that are `near` the roughly known poses, world_from_device, of query images."""
     session, rows = query_images
@@ -127,7 +127,7 @@ def pose_masks(
     world_from_cams = np.where(np.isnan(of_rig[:, :1, :1]), poses.lookup(times, sensors), of_rig)
     which = np.where(np.isnan(world_from_cams[:, 0, 0]), -1, np.arange(len(rows)))
     of_map = map_images[0].world_from_cam(map_images[1])
-    masks = (near(of_map, pose, distance_m, angle_deg)[None] for pose in world_from_cams)
+    masks = (near(of_map, pose, distance, angle_deg)[None] for pose in world_from_cams)
     return Masks.of(masks, which, len(of_map))
 
 

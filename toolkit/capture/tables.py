@@ -314,10 +314,7 @@ POSES_UNIT = {"position_std": "position_std_m", "moved": "moved_m"}
 
 
 def in_unit_of_poses(table: pd.DataFrame, unit: str | None) -> pd.DataFrame:
-    """Return a pair's table as it is written: if the unit of its poses is unknown (None), no length is named in meters.
-
-    A column `unit` then says `unknown`: lengths are in the unit of the poses. `read_query_table` restores the names.
-    """
+    """Return a pair's table as it is written: in an unknown unit (None), no name says meters, `unit` is `unknown`."""
     if unit is not None:
         return table
     return table.rename(columns={name: unknown for unknown, name in POSES_UNIT.items()}).assign(unit="unknown")
@@ -330,7 +327,7 @@ def read_query_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
     """
     types: dict[Any, Any] = {"timestamp": np.int64, "device_id": str, **dict.fromkeys(columns, str)}
     try:
-        table = pd.read_csv(path, dtype=types).rename(columns=POSES_UNIT)
+        table = pd.read_csv(path, dtype=types)
     except (OSError, ValueError, OverflowError) as error:
         raise ArtifactError(f"{path}: not a table of queries ({error}). Localize this pair again.") from None
     if missing := [name for name in types if name not in table]:

@@ -102,8 +102,8 @@ def export_exif(
     """Write copies of the query pictures with position and direction in EXIF; the pixels of JPEGs stay byte for byte.
 
     With `xmp`, write XMP files with these tags instead, `a.xmp` of `a.jpg`, to lie beside the pictures. Of a picture
-    that was localized in several maps, the pose with the most inliers is taken; with `unsure`, also one of low
-    confidence. Times and other tags stay. Return the number of pictures.
+    that was localized in several maps, the pose with the most inliers, then the surest, is taken; with `unsure`, also
+    one of low confidence. Times and other tags stay. Return the number of pictures.
 
     Raises:
         ManifestError: the folder `out` contains files; or two XMP files would have one name.
@@ -115,7 +115,7 @@ def export_exif(
     table = geo_table(run, capture)
     table = table.assign(sure=statuses(table["status"]) == str(Status.OK))
     table = table[table["latitude_deg"].notna() & (table["sure"] | unsure)]
-    table = table.sort_values(["sure", "num_inliers"], ascending=False, kind="stable")
+    table = table.sort_values("position_std_m").sort_values(["sure", "num_inliers"], ascending=False, kind="stable")
     table = table.drop_duplicates(["scene", "image"])
     if not len(table):
         raise ArtifactError(f"{run}: no query has a pose that is sure. Take the others by --unsure.")

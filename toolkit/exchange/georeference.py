@@ -93,8 +93,8 @@ def place(
     fitted = fit(source, target)
     if fitted is None:
         return Placing(None, record, [f"{how}: does not fit the model"])
-    new_from_old, inliers, residual_m, scale_deviation, level = fitted
-    facts = f"{np.count_nonzero(inliers)} of {len(common)} photographs, residual {residual_m:.2g} m in the median, "
+    new_from_old, fitting, residual_m, scale_deviation, level = fitted
+    facts = f"{np.count_nonzero(fitting)} of {len(common)} photographs, residual {residual_m:.2g} m in the median, "
     facts += f"scale known to {100 * scale_deviation:.1g} %"
     if scale_deviation > MAX_SCALE_DEVIATION:
         return Placing(None, record, [f"{how}: of no use for the scale, as the cameras are too close ({facts})"])
@@ -118,7 +118,7 @@ def _place_by_poses(
         return Placing(None, record, [f"{PRIOR}: none of a photograph in the model"])
     ours = np.stack([_upright(images[name], 0) for name in names])
     found = align_to_map(ours, np.stack([prior[name] for name in names]), center_noise_m=PRIOR_NOISE_M)
-    facts = f"{found.num_inliers} of {len(names)} photographs, residual {found.rmse_m:.2g} m, "
+    facts = f"{found.num_consistent} of {len(names)} photographs, residual {found.rmse_m:.2g} m, "
     facts += f"scale known to {100 * found.scale_std:.1g} %"
     if not found.scale_std <= MAX_SCALE_DEVIATION:
         return Placing(None, record, [f"{PRIOR}: of no use for the scale ({facts}; {found.reason})"])
@@ -153,7 +153,7 @@ def fit(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, Floats, float, 
     """Fit a similarity to positions (N, 3) with outliers; z is up in both, and stays so if they do not tell it better.
 
     Returns:
-        target_from_source, inliers (N,), the median of their errors, the relative standard deviation of the scale, and
+        target_from_source, fitting (N,), the median of their errors, the relative standard deviation of the scale, and
         whether the positions told what is up; None if nothing fits.
     """
     for max_error in MAX_ERRORS_M:
@@ -166,8 +166,8 @@ def fit(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, Floats, float, 
     new_from_old = found["tgt_from_src"]
     for _ in range(3):
         errors = np.linalg.norm(new_from_old * source - target, axis=1)
-        inliers = errors <= max(OUTLIER * np.median(errors), 1e-9)
-        a, b = source[inliers], target[inliers]
+        fitting = errors <= max(OUTLIER * np.median(errors), 1e-9)
+        a, b = source[fitting], target[fitting]
         new_from_old = pycolmap.estimate_sim3d(a, b) or new_from_old
     errors = np.linalg.norm(new_from_old * a - b, axis=1)
     # Of the model: noise spreads the known positions, which would then state a scale surer than it is.
@@ -183,7 +183,7 @@ def fit(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, Floats, float, 
         new_from_old = pycolmap.Sim3d(abs(turn), pycolmap.Rotation3d(rotation), shift)
         errors = np.linalg.norm(new_from_old * a - b, axis=1)
         sigma = np.sqrt((errors**2).sum() / max(3 * len(a) - 5, 1))
-    return new_from_old, inliers, float(np.median(errors)), float(sigma / max(np.linalg.norm(spread), 1e-9)), level
+    return new_from_old, fitting, float(np.median(errors)), float(sigma / max(np.linalg.norm(spread), 1e-9)), level
 
 
 def read_positions(path: Path) -> dict[str, Floats]:

@@ -59,7 +59,7 @@ FOLDER = "reconstruction"
 UNIT_HINT = "If you know a length, give --distance or --positions, or photographs with GPS"
 ALL_PAIRS = 60  # up to this number of photographs, all pairs are matched
 NEIGHBORS, SIMILAR = 10, 20  # else each photograph with so many next ones in its folder, and so many that look similar
-MIN_INLIERS = 15  # of a pair that counts
+MIN_VERIFIED = 15  # of a pair that counts
 MIN_MODEL = 3  # photographs of a model
 ESCALATED = 6  # similar ones of each photograph that SIFT leaves out, with which learned features are tried
 RATIO = 0.8  # of SIFT's matches; fewer of them are wrong than with the larger one for queries
@@ -226,15 +226,15 @@ class _Work:
             cameras = [self.cameras[self.camera_of[image]] for image in pair]
             sizes = [(camera.width, camera.height) for camera in cameras]
             a, b = (keypoints(image)[indices] for image, indices in zip(pair, matches.indices.T, strict=True))
-            inliers = epipolar_matches(sizes[0], a, sizes[1], b, matches.scores, tests=len(pairs))
-            return len(matches), matches.indices[inliers]
+            verified = epipolar_matches(sizes[0], a, sizes[1], b, matches.scores, tests=len(pairs))
+            return len(matches), matches.indices[verified]
 
         with one_thread():
             bar = tqdm(prefetch(verify, pairs, default_workers()), "verify", len(pairs), unit="pair")
-            for pair, (count, inliers) in zip(pairs, bar, strict=True):
+            for pair, (count, verified) in zip(pairs, bar, strict=True):
                 self.matched[pair] = max(count, self.matched.get(pair, 0))
-                if len(inliers) >= MIN_INLIERS:
-                    self.pairs[kind][pair] = inliers
+                if len(verified) >= MIN_VERIFIED:
+                    self.pairs[kind][pair] = verified
 
     def _position_priors(self, noise_m: float) -> list[pycolmap.PosePrior]:
         """Return the positions of rough poses, with the number of the image as that of the prior."""
@@ -249,7 +249,7 @@ class _Work:
             priors.append(prior)
         return priors
 
-    def inliers(self) -> Ints:
+    def verified(self) -> Ints:
         """(N, N) numbers of verified matches."""
         counts = np.zeros((len(self), len(self)), np.int64)
         for found in self.pairs:
@@ -589,7 +589,7 @@ def _reasons(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> dict[str
     """Return why each photograph that is not in the largest model is left out, by name."""
     numbered = reversed([*enumerate(models)])  # the largest comes last, and wins
     member = {image.name: number for number, model in numbered for image in model.images.values() if image.has_pose}
-    inliers, reasons = work.inliers(), dict(work.unusable)
+    shared, reasons = work.verified(), dict(work.unusable)
     inside = np.array([member.get(name) == 0 for name in work.names])
     for image, (name, item) in enumerate(zip(work.names, work.photographs, strict=True)):
         if inside[image] or item.name in reasons:
@@ -597,14 +597,14 @@ def _reasons(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> dict[str
         if name in member:
             size = models[member[name]].num_reg_images()
             reason = f"not connected: in model {member[name]}, of {size} photographs"
-        elif not inliers[image].any():
+        elif not shared[image].any():
             most = max((count for pair, count in work.matched.items() if image in pair), default=0)
             reason = f"no matches: at most {most} with another photograph, and these agree with no motion of the camera"
-        elif not inliers[image][inside].any():
-            count, other = np.count_nonzero(inliers[image]), work.photographs[int(inliers[image].argmax())].name
+        elif not shared[image][inside].any():
+            count, other = np.count_nonzero(shared[image]), work.photographs[int(shared[image].argmax())].name
             reason = f"not connected: matches {count} photographs, as {other}, none in the model"
         else:
-            reason = f"no pose: its {inliers[image][inside].max()} matches with the model's photographs agree with none"
+            reason = f"no pose: its {shared[image][inside].max()} matches with the model's photographs agree with none"
         reasons[item.name] = reason
     return reasons
 

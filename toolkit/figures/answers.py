@@ -36,7 +36,7 @@ from toolkit.mapping.local_map import LocalMap
 from toolkit.pose.base import View
 from toolkit.pose.confidence import bounded_by_rivals
 from toolkit.pose.result import CAMERA, QueryResult, Status
-from toolkit.results.localized import QueryDetails, query_details, sure_points
+from toolkit.results.localized import QueryDetails, is_predicted, query_details, sure_points
 from toolkit.results.metrics import is_posed, pose_errors
 
 if TYPE_CHECKING:
@@ -48,16 +48,14 @@ LABELS = {
     "inlier_ratio": ("inlier ratio", "{:.0%}"), "num_guided": ("guided matches", "{:.0f}"),
     "rmse_px": ("reprojection error [px]", "{:.2f}"), "coverage": ("image covered", "{:.0%}"),
     "p_correct": ("probability of being right", "{:.1%}"), "rival_support": ("support of the best rival", "{:.0%}"),
-    "agreement": ("matches of a second kind", "{:.0f}"), "position_std_m": ("std. dev. of position [{unit}]", "{:.2g}"),
+    "agreement": ("matches of a second kind", "{:.0f}"), "position_std": ("std. dev. of position [{unit}]", "{:.2g}"),
     "rotation_std_deg": ("std. dev. of rotation [deg]", "{:.2g}"), "scale_std": ("std. dev. of scale", "{:.1%}"),
 }  # fmt: skip
 """Numbers about a pose, attributes of a result: label and format of each; `{unit}` stands for the unit of lengths."""
-OF_NETWORKS = {
-    "num_matches": ("references given to it", "{:.0f}"), "num_inliers": ("consistent ones", "{:.0f}"),
-    "inlier_ratio": ("their share", "{:.0%}"),
-}  # fmt: skip
-"""Labels and formats that differ for poses of a feed-forward network."""
-OF_MATCHES = ("num_guided", "rmse_px", "coverage", "p_correct", "rival_support", "agreement")
+OF_MATCHES = (
+    "num_matches", "num_inliers", "inlier_ratio", "num_guided", "rmse_px", "coverage", "p_correct", "rival_support",
+    "agreement",
+)  # fmt: skip
 """Numbers that a pose without matches does not have."""
 STATUS_COLORS = {Status.OK: GREEN, Status.LOW_CONFIDENCE: ORANGE, Status.FAILED: VERMILLION}
 SURE = 2.4477
@@ -108,7 +106,7 @@ class Answer:
     def numbers(self) -> dict[str, float]:
         """The known ones of `LABELS`; lengths in `unit`, and named by it."""
         numbers = {name: float(getattr(self.result, name)) for name in LABELS}
-        numbers[f"position_std_{self.unit[0]}"] = numbers.pop("position_std_m") / self.unit[1]
+        numbers[f"position_std_{self.unit[0]}"] = numbers.pop("position_std") / self.unit[1]
         return {name: value for name, value in numbers.items() if np.isfinite(value)}
 
     @property
@@ -119,15 +117,14 @@ class Answer:
     @property
     def texts(self) -> dict[str, str]:
         """The known numbers, errors and seconds as texts by their label."""
-        by_network, unit, numbers = _is_by_network(self.result.found_by), self.unit[0], self.numbers
-        hidden = set(OF_MATCHES) if by_network else set[str]()
-        if self.result.world_from_rig is not None and not numbers.get("num_matches"):
-            hidden = {*OF_MATCHES, *OF_NETWORKS}
+        result, unit, numbers, by_network = self.result, self.unit[0], self.numbers, is_predicted(self.result.found_by)
+        no_matches = not result.num_matches and (by_network or result.world_from_rig is not None)
+        hidden = set(OF_MATCHES) if no_matches else set[str]()
         if not numbers.get("agreement"):
             hidden.add("agreement")
-        texts = {"method": self.result.found_by}
-        for name, (label, form) in (LABELS | OF_NETWORKS if by_network else LABELS).items():
-            value = numbers.get(f"position_std_{unit}" if name == "position_std_m" else name)
+        texts = {"method": result.found_by} | ({"consistent references": _consistent(result)} if by_network else {})
+        for name, (label, form) in LABELS.items():
+            value = numbers.get(f"position_std_{unit}" if name == "position_std" else name)
             if value is not None and name not in hidden:
                 texts[label.format(unit=unit)] = form.format(value)
         if self.error is not None:
@@ -153,7 +150,7 @@ class Answer:
     def matches(self) -> pd.DataFrame:
         """Counts of the correspondences: one row per kind (`sift/guided`), columns agree and rejected."""
         matches = self.result.correspondences
-        counts = pd.DataFrame({"agree": matches.inlier, "rejected": ~matches.inlier}, dtype=int)
+        counts = pd.DataFrame({"agree": matches.agrees, "rejected": ~matches.agrees}, dtype=int)
         return counts.groupby(pd.Index(matches.found_by.astype(object), name="found by")).sum()
 
     @cached_property
@@ -168,7 +165,7 @@ class Answer:
         kept, rows = set(matches.view_reference.tolist()), []
         for name in dict.fromkeys([*used, *self.result.rejected, *retrieved]):
             at = used.index(name) if name in used else -1
-            shared = int(matches.inlier[matches.view_of[matches.view_reference == at]].sum()) if at in kept else None
+            shared = int(matches.agrees[matches.view_of[matches.view_reference == at]].sum()) if at in kept else None
             of_retrieval = retrieved.get(name, (None, np.nan))
             rows.append((name, *of_retrieval, name in used, name in self.result.rejected, shared))
         table = pd.DataFrame(rows, columns=["name", "rank", "score", "used", "rejected", "shared"])
@@ -236,8 +233,9 @@ class Comparison:
 # In words
 
 
-def _is_by_network(method: str) -> bool:
-    return method.rpartition("/")[2].startswith("feed_forward")
+def _consistent(result: QueryResult) -> str:
+    """Return how many references of a predicted pose agree on it, such as `4 of 5`."""
+    return f"{len(result.references)} of {len(result.references) + len(result.rejected)}"
 
 
 def _digits(value: float) -> str:
@@ -250,7 +248,7 @@ def reason_in_words(result: QueryResult, numbers: Mapping[str, float], settings:
     """Return in a sentence why a query has its status; `numbers` are the known ones of `LABELS`, `settings` hold the
     limits.
     """
-    detail, method = result.reason, result.found_by
+    detail = result.reason
     if result.status is Status.FAILED:
         said = [_why_failed(detail, int(numbers.get("num_matches", 0)), settings.pnp.min_inliers)]
     elif detail == CAMERA:
@@ -261,7 +259,7 @@ def reason_in_words(result: QueryResult, numbers: Mapping[str, float], settings:
         said = ["This is the unchanged pose of the best reference, which is never called ok."]
     else:
         in_doubt = result.status is Status.LOW_CONFIDENCE
-        said = [*(_doubts(numbers, settings) if in_doubt else ()), *_support(numbers, method)]
+        said = [*(_doubts(numbers, settings) if in_doubt else ()), *_support(result, numbers)]
     remark = [f"{result.remark[0].upper()}{result.remark[1:]}."] if result.remark else []
     return " ".join([*said, *remark])
 
@@ -287,13 +285,13 @@ def _doubts(numbers: Mapping[str, float], settings: LocalizeSettings) -> list[st
     return doubts or ["It has too little support to be trusted."]
 
 
-def _support(numbers: Mapping[str, float], method: str) -> list[str]:
+def _support(result: QueryResult, numbers: Mapping[str, float]) -> list[str]:
+    if is_predicted(result.found_by):
+        return [f"{_consistent(result)} references agree on the pose."]
     if not numbers.get("num_matches"):
         return ["The pose comes from the references as a whole, not from matches."]
     counts = f"{numbers['num_inliers']:.0f} of {numbers['num_matches']:.0f}"
-    if _is_by_network(method):
-        return [f"{counts} references agree on the pose."]
-    text = f"{counts} matches agree on the pose ({numbers.get('inlier_ratio', np.nan):.0%})"
+    text = f"{counts} descriptor matches are inliers ({numbers.get('inlier_ratio', np.nan):.0%})"
     coverage, rival = numbers.get("coverage", np.nan), numbers.get("rival_support", 0.0)
     best = f"The best other pose has {rival:.0%} of its support." if rival else "No other pose was found."
     return [text + (f", in {coverage:.0%} of the image." if coverage > 0 else "."), best]
@@ -345,7 +343,7 @@ def _caption(details: QueryDetails) -> str:
     if not references:
         return f"{text} · no reference"
     both = np.isin(camera.matches, references[0][0].matches)
-    joined = f", {int(camera.inlier[both].sum())} of this image" if both.any() else ""
+    joined = f", {int(camera.agrees[both].sum())} of this image" if both.any() else ""
     return f"{text} · {references[0][1]}{joined}"
 
 

@@ -19,22 +19,19 @@ if TYPE_CHECKING:
 
 @styled
 def draw_prediction(
-    localizer: FeedForwardLocalizer,
-    query: Query,
-    answer: FeedForwardAnswer,
-    camera: int | None = None,
+    localizer: FeedForwardLocalizer, query: Query, answer: FeedForwardAnswer, camera: int | None = None,
     up: ArrayLike | None = None,
-) -> "Figure":
+) -> "Figure":  # fmt: skip
     """Draw one query image with its references, and the predicted cameras in the map; return the figure.
 
     By default, it is the image with the most consistent references, and up is estimated from the map's cameras.
     """
     if camera is None:
-        counts = [0 if result.alignment is None else result.alignment.num_inliers for result in answer.cameras]
+        counts = [0 if result.alignment is None else result.alignment.num_consistent for result in answer.cameras]
         camera = int(np.argmax(counts)) if counts else 0
     result = answer.cameras[camera] if answer.cameras else CameraAnswer(np.zeros(0, np.int64))
     views = [query.views[camera], *(localizer.view(int(index)) for index in result.references)]
-    kept = np.zeros(len(result.references), bool) if result.alignment is None else result.alignment.inliers
+    kept = np.zeros(len(result.references), bool) if result.alignment is None else result.alignment.consistent
     columns = 3
     rows = -(-len(views) // columns)
     figure = new_figure(14, max(5.5, 3.6 * rows))
@@ -49,7 +46,7 @@ def draw_prediction(
         row, column = 2 * (number // columns), number % columns
         panels[row, column].set_axis_on()
         draw_image(panels[row, column], view.image, 3, label, color, frame=color)
-        _draw_depth(panels[row + 1, column], number, result)
+        _draw_depth(panels[row + 1, column], number, result, *localizer.unit)
     simulated, estimate = localizer.predictor.simulated, answer.estimate
     title = f"{'SIMULATED, no result: ' if simulated else ''}{localizer.predictor.name} on {views[0].name}"
     scale = f"scale known to {estimate.scale_std:.1%}" if np.isfinite(estimate.scale_std) else "scale unknown"
@@ -60,13 +57,14 @@ def draw_prediction(
     return figure
 
 
-def _draw_depth(axis: "Axes", number: int, result: CameraAnswer) -> None:
-    """Draw the depth predicted of an image, in meters if the scale is known."""
+def _draw_depth(axis: "Axes", number: int, result: CameraAnswer, unit: str, length: float) -> None:
+    """Draw the depth predicted of an image, in a unit of this length if the scale is known."""
     prediction, alignment = result.prediction, result.alignment
     if prediction is None or prediction.depth is None or not np.isfinite(prediction.depth[number]).any():
         return
-    metric = alignment is not None and alignment.scale_known
-    values = prediction.depth[number] * (alignment.world_from_model.scale if alignment is not None and metric else 1.0)
+    known = alignment is not None and alignment.scale_known
+    scale = alignment.world_from_model.scale / length if alignment is not None and known else 1.0
+    values = scale * prediction.depth[number]
     low, high = np.nanpercentile(values, (5, 95))
     extent = None
     if prediction.map_from_image is not None:  # draw in pixels of the image
@@ -75,14 +73,15 @@ def _draw_depth(axis: "Axes", number: int, result: CameraAnswer) -> None:
         left, right = -offset_x / scale_x, (width - offset_x) / scale_x
         extent = (left, right, (height - offset_y) / scale_y, -offset_y / scale_y)
     axis.imshow(values, cmap="viridis", vmin=low, vmax=high, extent=extent)
-    axis.set_title(f"depth {low:.1f} to {high:.1f} {'m' if metric else '(no unit)'}", fontsize=7)
+    axis.set_title(f"depth {low:.1f} to {high:.1f} {unit if known else '(no unit)'}", fontsize=7)
 
 
 def _draw_from_above(
     axis: "Axes", localizer: FeedForwardLocalizer, result: CameraAnswer, kept: NDArray[np.bool_], up: ArrayLike | None
 ) -> None:
     local_map, alignment = localizer.map, result.alignment
-    ground, references = Ground.below(local_map.world_from_cams, up), local_map.world_from_cams[result.references]
+    references = local_map.world_from_cams[result.references]
+    ground = Ground.below(local_map.world_from_cams, up, localizer.unit)
     layers, drawn = [Layer(local_map.points, None, "0.73", s=1, lw=0, rasterized=True)], [references]
     layers.append(Layer(local_map.world_from_cams, "map", GRAY, 0.02, s=5))
     layers.append(Layer(references, "reference in the map", BLUE, 0.05, hollow=True, s=60, marker="s"))

@@ -105,7 +105,7 @@ def draw_matches(
     kinds = image.found_by if by_kind else np.full(len(image.pixels), "")
     for agrees in (False, True):
         for kind in sorted(set(kinds.tolist())):
-            chosen = (kinds == kind) & (image.inlier == agrees) & only
+            chosen = (kinds == kind) & (image.agrees == agrees) & only
             if chosen.any():
                 x, y = (image.pixels if at is None else at)[chosen].T
                 axis.scatter(x, y, s=size, lw=0, alpha=0.9 if agrees else 0.6, **style_of(kind, agrees))
@@ -130,7 +130,7 @@ def draw_joined(axis: "Axes", query: QueryDetails, inches: float, by_kind: bool 
             draw_matches(axis, image, 5, only=np.isin(image.matches, reference.matches))
         lines = np.stack([image.pixels[i], seen[j]], axis=1)
         for agrees in (False, True):
-            chosen = np.flatnonzero(image.inlier[i] == agrees)
+            chosen = np.flatnonzero(image.agrees[i] == agrees)
             chosen = chosen[:: len(chosen) // MAX_LINES + 1]
             kinds = image.found_by[i[chosen]].tolist() if by_kind else [""] * len(chosen)
             colors = [style_of(kind, agrees)["color"] for kind in kinds]
@@ -198,7 +198,7 @@ def draw_localization(query: QueryDetails, title: str = "", unit: tuple[str, flo
     widest = max((image.ratio for image, _, _ in references), default=1.0)
     figure = new_figure(4.4 * (shown.ratio + widest * -(-len(references) // rows) / rows) + 0.6, 5.3)
     axis, panels = query_and_references(figure, len(references), rows, shown.ratio, widest)
-    located, good = bool(is_posed(shown.world_from_cam)), shown.inlier
+    located, good = bool(is_posed(shown.world_from_cam)), shown.agrees
     if not located:
         caption = "query: not localized" + (f", {len(good)} matches" if len(good) else "")
     elif query.has_matches:
@@ -234,7 +234,7 @@ class WorstQuery:
     """Status and counts of matches."""
     details: QueryDetails
     rotation_deg: float = np.nan
-    translation_m: float = np.nan
+    translation: float = np.nan
     """Its errors; NaN without a pose or ground truth."""
     unit: str = "m"
     """Unit of lengths."""
@@ -254,12 +254,12 @@ def draw_worst(queries: Sequence[WorstQuery], title: str = "The worst queries") 
     for rank, (axis, query) in enumerate(zip(panels, queries, strict=False), start=1):
         draw_joined(axis, query.details, 2.2)
         image, references = query.details.cameras[0], query.details.captioned_references()
-        if references and not image.inlier[np.isin(image.matches, references[0][0].matches)].any():
+        if references and not image.agrees[np.isin(image.matches, references[0][0].matches)].any():
             text = "no common points" if query.details.has_matches else f"no matches; {references[0][1]}"
             box = {"facecolor": "black", "alpha": 0.6, "lw": 0, "pad": 2}
             axis.text(0.5, 0.04, text, ha="center", color="white", fontsize=8, bbox=box, transform=axis.transAxes)
-        has_error = np.isfinite(query.translation_m)
-        off = f"{_off_by(query.rotation_deg, query.translation_m, query.unit)}; " if has_error else ""
+        has_error = np.isfinite(query.translation)
+        off = f"{_off_by(query.rotation_deg, query.translation, query.unit)}; " if has_error else ""
         text = f"{rank}. {query.pair}: {off}{query.reason}\n{shown_name(image.name, MAX_LETTERS)}"
         axis.set_title(text, fontsize=8, loc="left", wrap=True)
     legend = "left: query, right: its best reference; lines: agreeing (green) and rejected matches (orange) of both"

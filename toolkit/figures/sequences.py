@@ -14,10 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.tables import POSE_NAMES, as_strings, read_query_table
-from toolkit.errors import ArtifactError
 from toolkit.figures.style import GREEN, ORANGE, SKY, VERMILLION, new_figure, percent, shared_legend, styled
 from toolkit.figures.top_view import Ground, Layer, draw_places
-from toolkit.files import pair_name, require_current, require_whole
+from toolkit.files import older_files, pair_name, require_whole, why_older
 from toolkit.geometry import Floats
 from toolkit.results.metrics import WRONG, Threshold, is_below, is_posed, pose_errors, summary_of, threshold_text
 
@@ -33,6 +32,13 @@ CHANGES = ("rescued", "broken")
 _KEY = ["timestamp", "device_id"]
 
 
+def warn_of_older(poses_dir: str | Path) -> None:
+    """Warn once of all sequences that were made from other poses of single queries, which `SequencePair.find` omits."""
+    older = [why for name, why in older_files(poses_dir, "sequence").items() if name.endswith(".txt")]
+    if older:
+        log.warning("Sequences of %d pairs are not used: %s", len(older), older[0])
+
+
 @dataclass(frozen=True)
 class SequencePair:
     """The files of the sequence stage of one pair: query poses after each step, and the poses of all frames."""
@@ -45,14 +51,8 @@ class SequencePair:
         """Return the files of a pair; None if the stage wrote none, or made them from other poses of single queries."""
         stem = Path(poses_dir) / pair_name(scene, map_device, query_device)
         single, sequence = (stem.with_name(f"{stem.name}{end}.txt") for end in ("", "_sequence"))
-        if not (single.is_file() and sequence.is_file()):
-            return None
-        try:
-            require_current(sequence, "sequence")
-        except ArtifactError as error:
-            log.warning("Not used: %s", error)
-            return None
-        return cls(stem)
+        found = single.is_file() and sequence.is_file() and not why_older(sequence, "sequence")
+        return cls(stem) if found else None
 
     @property
     def path(self) -> Path:

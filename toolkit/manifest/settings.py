@@ -282,7 +282,7 @@ class MaskSettings(Settings):
     poses: str | None = None
     """File with rough poses of the query devices in the map's frame, in the format of trajectories.txt; restricts the
     search to map images near these poses. null: no such prior."""
-    poses_distance_m: PositiveNumber = 10.0
+    poses_distance: PositiveNumber = 10.0
     """Largest distance between the rough pose and a map camera, in the unit of the poses."""
     gps: bool = False
     """Search only map images whose GPS fix (gps.txt) is near the query's; map images without a fix are kept."""
@@ -499,9 +499,9 @@ class PnpSettings(Settings):
         "scene/map.py": "sure_position_std_m",
     }
     ransac_max_error_deg: PositiveNumber = 0.45
-    """Largest reprojection error of an inlier in RANSAC, degrees."""
+    """Largest reprojection error of an inlier, degrees."""
     max_error_deg: PositiveNumber = 0.17
-    """Largest reprojection error of an inlier of the final pose, degrees."""
+    """Largest reprojection error of a guided match, degrees."""
     min_inliers: Positive = 12
     """Smallest number of independent inliers, among the matches found without guidance, of a pose; with fewer, the
     query has no pose."""

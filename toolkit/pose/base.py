@@ -124,7 +124,8 @@ class RoughPose:
     world_from_rig: Floats
     """(4, 4); world_from_cam for a single camera."""
     rotation_std_deg: float
-    position_std_m: float
+    position_std: float
+    """In the unit of the map's poses."""
 
 
 @dataclass(frozen=True)
@@ -142,13 +143,13 @@ class Prior:
 
     @classmethod
     def about(
-        cls, world_from_rig: Floats, images: Ints, rotation_std_deg: float, position_std_m: float, source: str
+        cls, world_from_rig: Floats, images: Ints, rotation_std_deg: float, position_std: float, source: str
     ) -> "Prior":
         """Return a prior whose search radius covers two standard deviations, within `SEARCH_DEG`.
 
-        `position_std_m` is in map lengths.
+        `position_std` is in map lengths.
         """
-        spread_deg = rotation_std_deg + np.degrees(np.arctan(position_std_m / NEARBY_M))
+        spread_deg = rotation_std_deg + np.degrees(np.arctan(position_std / NEARBY_M))
         return cls(world_from_rig, images, float(np.clip(2 * spread_deg, *SEARCH_DEG)), source)
 
     def scaled(self, factor: float) -> "Prior":

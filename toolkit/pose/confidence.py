@@ -7,13 +7,12 @@ and on real images that it darkens, blurs, fogs and half covers, and measures th
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.special import expit
-from scipy.stats import chi2
+from scipy.special import chdtr, expit
 
 from toolkit.geometry import Floats
 
 EVIDENCE = (
-    "num_inliers", "inlier_ratio", "coverage", "rival_support", "position_std_m", "rotation_std_deg", "agreement"
+    "num_inliers", "inlier_ratio", "coverage", "rival_support", "position_std", "rotation_std_deg", "agreement"
 )  # fmt: skip
 """Inputs of the regression: attributes of `QueryResult` and columns of `poses/<pair>.csv`."""
 WEIGHTS: dict[str, float] = {
@@ -41,7 +40,7 @@ LIMITS = (0.5, 5.0)  # meters, degrees: a pose within them is correct
 MARGIN = 1.5  # factor on stated deviations, which are right only to about as much
 
 
-def bounded_by_deviation(probability: float, position_std_m: float, rotation_std_deg: float) -> float:
+def bounded_by_deviation(probability: float, position_std: float, rotation_std_deg: float) -> float:
     """Return the probability that a pose is correct, at most what its standard deviations leave.
 
     The probability that normal errors with `MARGIN` times these deviations, equal along three axes, are within
@@ -49,10 +48,11 @@ def bounded_by_deviation(probability: float, position_std_m: float, rotation_std
 
     Args:
         probability: that of the pose without this bound.
-        position_std_m, rotation_std_deg: of the pose, as in `EVIDENCE`.
+        position_std: of the pose, map lengths, see `Survey.length`, as in `EVIDENCE`.
+        rotation_std_deg: of the pose.
     """
-    stds = MARGIN * np.array([position_std_m, rotation_std_deg]) / np.sqrt(3)
-    within = chi2.cdf((np.array(LIMITS) / np.maximum(stds, 1e-9)) ** 2, 3)
+    stds = MARGIN * np.array([position_std, rotation_std_deg]) / np.sqrt(3)
+    within = chdtr(3, (np.array(LIMITS) / np.maximum(stds, 1e-9)) ** 2)  # scipy.stats takes 0.5 s to import
     return float(min(probability, np.nan_to_num(within.prod(), nan=0.0)))
 
 

@@ -34,8 +34,8 @@ from toolkit.pose.result import CAMERA, Correspondences, QueryResult, Rival, Sta
 from toolkit.pose.rig import CELLS, Matches, RigQuery, least_squares_covariance
 from toolkit.threads import fixed_sums
 
-PNP_FORMAT = 7
-"""Version of the poses. Increase when the same settings and files give other poses."""
+PNP_FORMAT = 8
+"""Version of the poses. Increase when the same settings and files give other poses, or they are written otherwise."""
 FIRST_REFERENCES = {2: 200, 4: 100}
 """Number of references per image to match first -> independent inliers that their pose needs to be kept. The next
 number, and finally all references, are matched if the pose has fewer, or if too few of the matches are inliers."""
@@ -425,7 +425,7 @@ class PnpLocalizer(Localizer):
         )
         evidence = {name: getattr(estimate, name) for name in EVIDENCE}
         probability = bounded_by_rivals(float(probability_right(evidence)), [rival.support for rival in rivals])
-        probability = bounded_by_deviation(probability, estimate.position_std_m, estimate.rotation_std_deg)
+        probability = bounded_by_deviation(probability, estimate.position_std, estimate.rotation_std_deg)
         certain = probability >= settings.ok_probability and estimate.rival_support <= MAX_RIVAL_SUPPORT
         return replace(estimate, status=Status.OK if certain else Status.LOW_CONFIDENCE, p_correct=probability)
 
@@ -435,15 +435,15 @@ class PnpLocalizer(Localizer):
         return int(np.sort(counts)[-2]) if len(counts) > 1 else 0
 
     def _correspondences(
-        self, matches: Matches, inlier: NDArray[np.bool_], guided: int, references: Sequence[int]
+        self, matches: Matches, agrees: NDArray[np.bool_], guided: int, references: Sequence[int]
     ) -> Correspondences:
         """Return K matches as correspondences, with the keypoints of the first `VIEWS` references.
 
         Args:
             matches: guided matches first.
-            inlier: (K,) whether the pose agrees.
+            agrees: (K,) whether they agree with the pose.
             guided: number of guided matches.
-            references: map images, those that observe the most inliers first.
+            references: map images, those that observe the most points that agree first.
         """
         views = [(rank, *self.matcher.keypoints(i, matches.point)) for rank, i in enumerate(references[:VIEWS])]
         found_by = np.repeat(["/guided", "/descriptors"], [guided, len(matches) - guided])
@@ -452,7 +452,7 @@ class PnpLocalizer(Localizer):
             pixels=matches.pixels,
             points=self.map.points[matches.point],
             point_index=matches.point,
-            inlier=inlier,
+            agrees=agrees,
             found_by=np.char.add(self.matcher.kind_names(matches.point), found_by),
             view_of=np.concatenate([np.zeros(0, np.int64), *(at for _, at, _ in views)]),
             view_reference=np.concatenate([np.zeros(0, np.int64), *(np.full(len(at), rank) for rank, at, _ in views)]),

@@ -71,8 +71,8 @@ class Correspondences:
     """(K, 3) in the world, meters."""
     point_index: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     """(K,) index of the map point, counted through all maps in order; -1 for a point lifted by depth."""
-    inlier: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
-    """(K,) whether it agrees with the pose; `num_inliers` counts only those found by descriptors alone."""
+    agrees: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+    """(K,) whether it agrees with the pose: guided, or within `max_error_deg`. `num_inliers` is another number."""
     found_by: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, "U1"))
     """(K,) `<kind of features>/<descriptors, guided or lifted>`."""
     view_of: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -101,7 +101,7 @@ _STORED: dict[str, tuple[type[np.generic], tuple[int, ...]]] = {
     "pixels": (np.float32, (2,)),
     "points": (np.float64, (3,)),
     "point_index": (np.int32, ()),
-    "inlier": (np.bool_, ()),
+    "agrees": (np.bool_, ()),
     "view_of": (np.int32, ()),
     "view_reference": (np.int32, ()),
     "view_pixels": (np.float32, (2,)),
@@ -124,7 +124,8 @@ class QueryResult:
     num_matches: int = 0
     """2D-3D matches found from descriptors alone."""
     num_inliers: int = 0
-    """Those of `num_matches` within `ransac_max_error_deg` of the final pose."""
+    """Inliers: those of `num_matches` within `ransac_max_error_deg` of the final pose. Those that share a point or a
+    keypoint count once."""
     num_guided: int = 0
     """Guided matches within `max_error_deg`, from which the final pose is computed."""
     rmse_px: float = float("nan")
@@ -144,7 +145,7 @@ class QueryResult:
     references: tuple[str, ...] = ()
     """Names of the map images that support the pose, best first."""
     correspondences: Correspondences = field(default_factory=Correspondences)
-    """Inliers and outliers of the pose."""
+    """Matches that agree with the pose, and those that do not."""
     found_by: str = "pnp"
     """Method that found the pose: `pnp`; `pnp+feed_forward` or `pnp+near` (PnP from a prior); `lifted` (map features
     lifted by the capture's depth maps); `lifted+feed_forward` (also by predicted depth); `feed_forward` (a
@@ -188,7 +189,7 @@ class QueryResult:
 
         Args:
             others: further results in the same map.
-            rays: draw a ray from the camera through each inlier to its map point.
+            rays: draw a ray from the camera through each match that agrees to its map point.
 
         Raises:
             ArtifactError: the result is not of a `Map` or `Run`.
@@ -223,7 +224,8 @@ class QueryResult:
         return f"{self.status}: {self.reason}" if self.reason else str(self.status)
 
     @property
-    def position_std_m(self) -> float:
+    def position_std(self) -> float:
+        """In the unit of the poses: meters, if it is known."""
         return float("nan") if self.covariance is None else float(stds_of(self.covariance)[1])
 
     @property
@@ -340,11 +342,11 @@ class QueryResult:
 
 _NUMBERS = {
     "num_inliers": 0, "num_matches": 0, "inlier_ratio": 4, "num_guided": 0, "rmse_px": 4, "rival_support": 4,
-    "coverage": 4, "agreement": 0, "p_correct": 4, "position_std_m": 6, "rotation_std_deg": 6, "seconds": 4,
+    "coverage": 4, "agreement": 0, "p_correct": 4, "position_std": 6, "rotation_std_deg": 6, "seconds": 4,
     "scale_std": 6,
 }  # fmt: skip
 """Numbers in the table, and the decimals that they are rounded to."""
-_FROM_OTHERS = ("inlier_ratio", "position_std_m", "rotation_std_deg")
+_FROM_OTHERS = ("inlier_ratio", "position_std", "rotation_std_deg")
 """Numbers that follow from other attributes."""
 
 

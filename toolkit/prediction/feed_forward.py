@@ -166,12 +166,12 @@ class FeedForwardLocalizer(Localizer):
         settings: PredictorSettings | None = None,
         turns: Turns | None = None,
         length: float = 1.0,
+        unit: tuple[str, float] = ("m", 1.0),
     ):
         """Depths of the depth maps of the map's session are divided by `length`, see `Survey.length`; `turns` make
-        images upright for the predictor.
+        images upright for the predictor; `unit` is the one that lengths are shown in, with its length in the map.
         """
-        self.map = local_map
-        self.predictor = predictor
+        self.map, self.predictor, self.unit = local_map, predictor, unit
         self.settings = settings or PredictorSettings()
         self._session = session
         self.seen_depth = depth_of_images(session, local_map.image_names, length)
@@ -292,7 +292,7 @@ class FeedForwardLocalizer(Localizer):
         pose, covariance = query_pose(alignment, model[0])
         if not alignment.scale_known:
             # An arbitrary scale moves the query along a line; the position of a reference is a better guess.
-            pose[:3, 3] = world[int(np.argmax(alignment.inliers)), :3, 3]
+            pose[:3, 3] = world[int(np.argmax(alignment.consistent)), :3, 3]
         return CameraAnswer(references, prediction, alignment, pose, covariance, alignment.reason, tuple(ratios))
 
     def _depth_ratios(self, image: int, prediction: Prediction, view: int) -> Floats:
@@ -333,13 +333,12 @@ def depth_of_images(session: Session, names: Sequence[str], length: float = 1.0)
 
 def _combine(query: Query, cameras: tuple[CameraAnswer, ...], image_names: Sequence[str]) -> QueryResult:
     """Combine the poses of the cameras of a device into one estimate."""
-    count = sum(len(answer.references) for answer in cameras if answer.prediction is not None)
     reasons = "; ".join(dict.fromkeys(answer.reason for answer in cameras if answer.reason))
     alignments = {index: answer.alignment for index, answer in enumerate(cameras) if answer.alignment is not None}
     poses = {index: answer.world_from_cam for index, answer in enumerate(cameras) if answer.world_from_cam is not None}
     covariances = {index: answer.covariance for index, answer in enumerate(cameras) if answer.covariance is not None}
     if not poses:
-        return QueryResult.failed(reasons, num_matches=count, found_by="feed_forward")
+        return QueryResult.failed(reasons, found_by="feed_forward")
     known = [index for index in poses if np.isfinite(covariances[index]).all()]
     if known:
         mean = robust_mean_pose(
@@ -347,7 +346,7 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...], image_names: Seque
             np.stack([carried_over(covariances[index], query.rig_from_cams[index]) for index in known]),
         )
         pose, covariance = mean.world_from_cam, mean.covariance
-        kept = [index for index, inside in zip(known, mean.inliers, strict=True) if inside]
+        kept = [index for index, inside in zip(known, mean.consistent, strict=True) if inside]
         reasons = "; ".join(filter(None, (reasons, mean.reason)))
         agreed = np.isfinite(covariance).all() and 2 * len(kept) > len(known)
         sure = agreed and any(is_trustworthy(alignments[index], covariance) for index in kept)
@@ -362,15 +361,13 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...], image_names: Seque
     if misfit:
         seen = ", ".join(f"{focal:.0f}" for focal in focals if np.isfinite(focal))
         reasons = "; ".join(filter(None, (reasons, f"the network sees a focal length of {seen} px")))
-    consistent = [int(i) for index in kept for i in cameras[index].references[alignments[index].inliers]]
+    consistent = [int(i) for index in kept for i in cameras[index].references[alignments[index].consistent]]
     shown = [int(i) for answer in cameras if answer.prediction is not None for i in answer.references]
     return QueryResult(
         Status.OK if sure and not misfit else Status.LOW_CONFIDENCE,
         CAMERA if misfit else "",
         world_from_rig=pose,
         covariance=covariance,
-        num_matches=count,
-        num_inliers=len(consistent),
         references=tuple(image_names[index] for index in dict.fromkeys(consistent)),
         found_by="feed_forward",
         scale_std=min(alignments[index].scale_std for index in kept),

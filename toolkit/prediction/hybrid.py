@@ -68,10 +68,10 @@ class HybridLocalizer(Localizer):
 
     def _prior(self, predicted: QueryResult) -> Prior | None:
         """Return the predicted pose as a prior for matching; None if its position is unknown."""
-        if predicted.world_from_rig is None or not np.isfinite(predicted.position_std_m):
+        if predicted.world_from_rig is None or not np.isfinite(predicted.position_std):
             return None
         images = np.array([self._index_of[name] for name in predicted.references], np.int64)
-        stds = predicted.rotation_std_deg, predicted.position_std_m
+        stds = predicted.rotation_std_deg, predicted.position_std
         return Prior.about(predicted.world_from_rig, images, *stds, "feed_forward")
 
 

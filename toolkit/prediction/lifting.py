@@ -284,7 +284,7 @@ def _predictions(answer: FeedForwardAnswer) -> dict[int, tuple[CameraAnswer, int
         if camera.prediction is None or camera.alignment is None or camera.world_from_cam is None:
             continue
         for view, image in enumerate(camera.references, start=1):
-            if camera.alignment.inliers[view - 1]:
+            if camera.alignment.consistent[view - 1]:
                 predictions.setdefault(int(image), (camera, view))
     return predictions
 

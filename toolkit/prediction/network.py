@@ -3,7 +3,7 @@
 import logging
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,9 +49,14 @@ def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) 
             settings.dtype_compute,
             architecture=ARCHITECTURES[predictor.name],
         )
-    log.warning("predictor: simulated looks up the true poses of the queries. Its poses are no results.")
+    _warn_of_simulation()
     sessions = [*capture.usable("map"), *capture.usable("query")]
     return SimulatedPredictor(sessions, map_dir, settings.features.kinds[0], seed=settings.seed)
+
+
+@cache
+def _warn_of_simulation() -> None:
+    log.warning("predictor: simulated looks up the true poses of the queries. Its poses are no results.")
 
 
 class TokenCache:

@@ -310,7 +310,7 @@ def _read_statuses(files: SceneFiles, messages: list[str]) -> pd.DataFrame:
             messages.append(f"{path.name} cannot be read")
             continue
         devices = dict(zip(("map_device", "query_device"), results.devices, strict=True))
-        tables.append(results.table.reindex(columns=STATUS_COLUMNS).assign(**devices))
+        tables.append(results.table.rename(columns=POSES_UNIT).reindex(columns=STATUS_COLUMNS).assign(**devices))
     return pd.concat(tables, ignore_index=True)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -55,7 +55,7 @@ class ShownImage:
     """(n, 3) map points, world, meters."""
     matches: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     """(n,) numbers of the correspondences; pixels with the same number in two images match."""
-    inlier: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+    agrees: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
     """(n,) whether each correspondence agrees with the pose."""
     world_from_cam_true: Floats = field(default_factory=lambda: np.full((4, 4), np.nan))
     """(4, 4); NaN if unknown."""
@@ -65,7 +65,7 @@ class ShownImage:
     @property
     def num_agreeing(self) -> int:
         """Number of correspondences that agree with the pose, guided ones too; not that of inliers."""
-        return int(self.inlier.sum())
+        return int(self.agrees.sum())
 
     @property
     def ratio(self) -> float:
@@ -73,7 +73,7 @@ class ShownImage:
         return float(self.camera.width / self.camera.height)
 
 
-_OF_A_MATCH = ("pixels", "points", "matches", "inlier", "found_by")
+_OF_A_MATCH = ("pixels", "points", "matches", "agrees", "found_by")
 
 
 @dataclass(frozen=True)
@@ -133,10 +133,18 @@ class QueryDetails:
         return [*agree[: REFERENCES - min(2, len(rejected))], *rejected][:REFERENCES]
 
 
+def is_predicted(method: str) -> bool:
+    """Tell whether a pose is that of a network, from the column `method`, such as `hybrid:vggt/feed_forward`."""
+    return method.rpartition("/")[2].startswith("feed_forward")
+
+
 def support_of(row: pd.Series) -> str:
-    """Return the support of the pose in a row of a pair's csv as text, such as `120 inliers`."""
-    by_network = str(row.get("method", "")).rpartition("/")[2].startswith("feed_forward")
-    return f"{row['num_inliers']:.0f} {'consistent references' if by_network else 'inliers'}"
+    """Return the support of the pose in a row of a pair's csv as text, such as `120 inliers`; empty if it has none."""
+    if row.get("num_inliers", 0) > 0:
+        return f"{row['num_inliers']:.0f} inliers"
+    if is_predicted(str(row.get("method"))) and pd.notna(references := row.get("references", np.nan)):
+        return f"{references.count(';') + 1} consistent references"
+    return ""
 
 
 @dataclass(frozen=True)
@@ -244,7 +252,7 @@ def query_details(
         number = result.images.index(view.name) if view.name in result.images else -1
         matches = np.flatnonzero(found.camera == number)
         of_image = view.name, view.image, view.camera, pose @ rig_from_cam
-        cameras.append((_shown(*of_image, result, matches, found.pixels[matches], true @ rig_from_cam), rig_from_cam))
+        cameras.append((_shown(result, matches, true @ rig_from_cam, *of_image, found.pixels[matches]), rig_from_cam))
     cameras.sort(key=lambda camera: -camera[0].num_agreeing)
     used = _references(map_session, result, {name: number for number, name in enumerate(result.references)})
     rejected = _references(map_session, result, dict.fromkeys(result.rejected, -1))
@@ -258,23 +266,12 @@ def _references(session: Session, result: QueryResult, numbers: Mapping[str, int
         row, views = session.row_of_name[name], np.flatnonzero(matches.view_reference == numbers[name])
         of_image = name, session.image_path(row), session.cameras([row])[0], session.world_from_cam([row])[0]
         true = session.world_from_cam([row], ground_truth=True)[0]
-        images.append(_shown(*of_image, result, matches.view_of[views], matches.view_pixels[views], true))
+        images.append(_shown(result, matches.view_of[views], true, *of_image, matches.view_pixels[views]))
     return images
 
 
-def _shown(
-    name: str,
-    image: Path | NDArray[np.uint8],
-    camera: "pycolmap.Camera",
-    world_from_cam: Floats,
-    result: QueryResult,
-    matches: Ints,
-    pixels: Floats,
-    world_from_cam_true: Floats,
-) -> ShownImage:
+def _shown(result: QueryResult, matches: Ints, true: Floats, *of_image: Any) -> ShownImage:
+    """Return an image (name, file, camera, pose, pixels of its matches) with its matches and its true pose."""
     found = result.correspondences
-    return ShownImage(
-        *(name, image, camera, world_from_cam, pixels),
-        *(found.points[matches], matches, found.inlier[matches]),
-        *(world_from_cam_true, found.found_by[matches]),
-    )
+    of_matches = found.points[matches], matches, found.agrees[matches], true, found.found_by[matches]
+    return ShownImage(*(*of_image, *of_matches))

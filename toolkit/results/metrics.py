@@ -88,11 +88,11 @@ def pose_errors(
         raise ValueError(f"Expected one true pose per estimate, got {truths.shape} for {estimates.shape}.")
     has_truth, has_estimate = is_posed(truths), is_posed(estimates)
     rotation_deg = np.where(has_truth, np.inf, np.nan)
-    translation_m = rotation_deg.copy()
+    translation = rotation_deg.copy()
     both = has_truth & has_estimate
     if both.any():
-        rotation_deg[both], translation_m[both] = pose_error(estimates[both], truths[both])
-    return rotation_deg, translation_m
+        rotation_deg[both], translation[both] = pose_error(estimates[both], truths[both])
+    return rotation_deg, translation
 
 
 def poses_of(poses: "Trajectory | Floats", keys: pd.DataFrame | None) -> Floats:
@@ -120,9 +120,9 @@ def recall(rotation_deg: Floats, translation_m: Floats, thresholds: Sequence[Thr
     return np.array([np.mean(is_below(rotation_deg, translation_m, threshold)) for threshold in thresholds])
 
 
-def is_below(rotation_deg: Floats, translation_m: Floats, threshold: Threshold) -> NDArray[np.bool_]:
+def is_below(rotation_deg: Floats, translation: Floats, threshold: Threshold) -> NDArray[np.bool_]:
     """Return which queries have both errors strictly below a threshold."""
-    return (rotation_deg < threshold[0]) & (translation_m < threshold[1])
+    return (rotation_deg < threshold[0]) & (translation < threshold[1])
 
 
 def threshold_name(threshold: Threshold, unit: str = "m") -> str:

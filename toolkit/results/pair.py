@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from toolkit.capture import Trajectory
-from toolkit.capture.tables import read_query_table
+from toolkit.capture.tables import POSES_UNIT, read_query_table
 from toolkit.errors import ArtifactError, CaptureError, DamagedError, first_line
 from toolkit.files import (
     image_name,
@@ -173,7 +173,8 @@ class PairResults:
         """
         keys = self.table[["timestamp", "device_id"]]
         rotation_deg, translation = pose_errors(self.poses, truth, keys) if len(self) else (np.zeros(0), np.zeros(0))
-        table = self.table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation)
+        table = self.table.rename(columns=POSES_UNIT)
+        table = table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation)
         lengths = table.columns.intersection(["translation_error_m", "position_std_m"])
         return named_by_unit(table.assign(**table[lengths] / self.unit[1]), self.unit[0])
 

@@ -173,6 +173,7 @@ def open_cluster(spec: str | None, say: Callable[[str], object] = print) -> Iter
         yield
         return
     optional("distributed")
+    logging.getLogger("distributed").setLevel(logging.ERROR)  # it warns of workers that it ends itself
     with ExitStack() as stack:
         address, link = _start(spec, stack)
         try:

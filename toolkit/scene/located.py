@@ -205,8 +205,8 @@ def show_matches(scene_map: Map, matches: QueryMatches, rank: int, image: int) -
 
     def shown(name: str, file: Any, camera: pycolmap.Camera, at: Floats) -> ShownImage:
         points = np.zeros((len(seen), 3))
-        inlier = np.ones(len(seen), bool)
-        return ShownImage(name, file, camera, np.eye(4), at, points, both, inlier, found_by=ways)
+        agrees = np.ones(len(seen), bool)
+        return ShownImage(name, file, camera, np.eye(4), at, points, both, agrees, found_by=ways)
 
     reference = shown(name, scene_map.session.image_path(row), scene_map.session.cameras([row])[0], pixels)
     query = shown(view.name, view.image, view.camera, of_pair.pixels[seen])

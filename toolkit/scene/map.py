@@ -59,7 +59,7 @@ from toolkit.prediction.hybrid import HybridLocalizer
 from toolkit.prediction.interface import Predictor
 from toolkit.prediction.lifting import LiftingLocalizer, lifts
 from toolkit.prediction.network import open_predictor
-from toolkit.results.metrics import is_posed, length_unit
+from toolkit.results.metrics import UNKNOWN_UNIT, is_posed, length_unit
 from toolkit.results.opening import (
     RETRIEVAL,
     SESSIONS_ROOT,
@@ -366,7 +366,7 @@ class Map:
             return False
         limit = MAX_SURE_STD_M * (1.0 if self.settings.unit else self.length)
         # A pose without matches has no deviation (NaN) and counts as precise.
-        return result.status is not Status.OK or result.position_std_m > limit
+        return result.status is not Status.OK or result.position_std > limit
 
     def needs_fallback(self, query: Query, references: Sequence[References], result: QueryResult) -> bool:
         """Tell whether a result is not sure, and the query has what fallback features need."""
@@ -419,7 +419,7 @@ class Map:
 
     def _prior(self, near: RoughPose, references: Sequence[References]) -> Prior:
         images = np.unique(np.concatenate([retrieved.images for retrieved in references]))
-        position_std = near.position_std_m / self.length  # the depth that it is compared with is in map lengths
+        position_std = near.position_std / self.length  # the depth that it is compared with is in map lengths
         return Prior.about(near.world_from_rig, images, near.rotation_std_deg, position_std, "near")
 
     def _may_show(self, world_from_cam: Floats, near: RoughPose) -> NDArray[np.bool_] | None:
@@ -427,7 +427,7 @@ class Map:
         mask = masks.near(
             self.session.world_from_cam(self.search.rows),
             world_from_cam,
-            NEAR * self.length + 3 * near.position_std_m,
+            NEAR * self.length + 3 * near.position_std,
             NEAR_DEG + 3 * near.rotation_std_deg,
         )
         return mask if mask.any() else None
@@ -498,8 +498,9 @@ class Map:
             of_image = depth_of_images(self.session, pnp.image_names, self.length)
             return LiftingLocalizer(pnp, of_image) if lifts(settings, self.session) else pnp
         predictor = self.predictor or open_predictor(settings, self.capture, self.map_dir)
+        unit = ("m", 1 / self.length) if self.settings.unit else (UNKNOWN_UNIT, 1.0)
         feed_forward = FeedForwardLocalizer(
-            self.in_lengths[0].map, self.session, predictor, settings.predictor, self.turns, self.length
+            self.in_lengths[0].map, self.session, predictor, settings.predictor, self.turns, self.length, unit
         )
         return feed_forward if settings.method == "feed_forward" else HybridLocalizer(pnp, feed_forward)
 

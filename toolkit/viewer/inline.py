@@ -157,7 +157,7 @@ class View3D:
             poses += [(pose, f"rival, {support:.0%} of the support", BLUE) for pose, support in answer.details.rivals]
             cameras += [of_camera for of_camera in poses if is_posed(of_camera[0])]
             if self.rays and is_posed(camera.world_from_cam):
-                rays.append((camera.world_from_cam[:3, 3], camera.points[camera.inlier]))
+                rays.append((camera.world_from_cam[:3, 3], camera.points[camera.agrees]))
         up = np.asarray(up_of_cameras(self._poses) if self.world_up is None else self.world_up, np.float64)
         eye = Eye.of(self._poses, up, [pose for pose, _, _ in cameras]).farther(1.4)
         size, points = camera_depth_m(self._poses[:, :3, 3]), self._cloud[0]

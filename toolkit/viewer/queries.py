@@ -181,7 +181,7 @@ class _ChosenWriter:
             depth_m = self._depth_m if has_truth else viewer.HIDDEN_M
             pinhole = viewer.pinhole_of(camera, (camera.width, camera.height), depth_m, TRUE)
             stream.log("world/truth/camera_0", pinhole)
-        points = np.concatenate([np.zeros((0, 3)), *(image.points[image.inlier] for image in query.cameras)])
+        points = np.concatenate([np.zeros((0, 3)), *(image.points[image.agrees] for image in query.cameras)])
         dots = rr.Points3D(points + self._shift, colors=viewer.rgb(GREEN), radii=rr.Radius.ui_points(3))
         stream.log("world/chosen_points", dots)
         located = bool(np.isfinite(center).all())
@@ -227,7 +227,7 @@ class _ChosenWriter:
         """Log an image (None: a gray one) with its camera, keypoints and, for `residuals`, projected points."""
         import rerun as rr
 
-        stream, measured, inlier = self._stream, np.zeros((0, 2)), np.zeros(0, bool)
+        stream, measured, agrees = self._stream, np.zeros((0, 2)), np.zeros(0, bool)
         predicted, lines = np.zeros((0, 2)), np.zeros((0, 2, 2))
         if image is None:
             # Keep the size of the last image: the viewer treats the images of an entity as frames of a video.
@@ -242,16 +242,16 @@ class _ChosenWriter:
             depth_m = self._depth_m if located else viewer.HIDDEN_M
             stream.log(path, viewer.pinhole_of(image.camera, self._sizes[path], depth_m, color))
             scale = np.array(self._sizes[path]) / [image.camera.width, image.camera.height]
-            measured, inlier = image.pixels * scale, image.inlier
-            if located and residuals and inlier.any():
-                pixels, visible = project(image.points[inlier], image.camera, image.world_from_cam)
+            measured, agrees = image.pixels * scale, image.agrees
+            if located and residuals and agrees.any():
+                pixels, visible = project(image.points[agrees], image.camera, image.world_from_cam)
                 predicted = pixels[visible] * scale
-                lines = np.stack([measured[inlier][visible], predicted], axis=1)
+                lines = np.stack([measured[agrees][visible], predicted], axis=1)
         stream.log(f"{path}/image", rr.EncodedImage(contents=data, media_type="image/jpeg"))
         for name, marks, shade, radius in (
             ("reprojected", predicted, viewer.rgb(GREEN), 2.5),
-            ("measured", measured[inlier], WHITE, 1.5),
-            ("rejected", measured[~inlier], viewer.rgb(ORANGE), 1.5),
+            ("measured", measured[agrees], WHITE, 1.5),
+            ("rejected", measured[~agrees], viewer.rgb(ORANGE), 1.5),
         ):
             dots = rr.Points2D(marks, colors=shade, radii=rr.Radius.ui_points(radius))
             stream.log(f"{path}/marks/{name}", dots)
@@ -268,6 +268,4 @@ def describe(queries: Localizations, k: int) -> str:
     parts = [str(queries.names[k]), str(row["status"])]
     if np.isfinite(row["translation_error_m"]):
         parts.append(f"off by {row['rotation_error_deg']:.2g}°, {row['translation_error_m']:.3g} {queries.unit[0]}")
-    if row.get("num_inliers", 0) > 0:
-        parts.append(support_of(row))
-    return ", ".join(parts)
+    return ", ".join(filter(None, [*parts, support_of(row)]))
