@@ -12,6 +12,7 @@ from toolkit.errors import ManifestError
 from toolkit.files import SceneFiles, write_text
 from toolkit.manifest import Manifest, load_manifest
 from toolkit.pipeline import sweep
+from toolkit.runs.folder import RunLog
 from toolkit.runs.sweep import changed_keys, swept_runs, take_over, variant_name
 from toolkit.store.items import Items
 
@@ -67,6 +68,17 @@ def manifest(root: Path, name: str, **sections: Any) -> Manifest:
     content = Manifest.of({"name": name, "captures": ["P"], "output_root": str(root), **sections})
     write_text(root / name / "run.json", json.dumps({"manifest": content.model_dump(mode="json", exclude_none=True)}))
     return content
+
+
+def test_the_record_of_a_run_that_reranks_is_read_again(tmp_path: Path) -> None:
+    """Retrieval finds what reranking asks for; the record once said `topk: 10`, which the manifest then refused."""
+    settings = {"captures": ["P"], "output_root": str(tmp_path), "seed": 5, "rerank": {"topn": 30}}
+    donor = SceneFiles(tmp_path / "a", "P")
+    donor.poses_dir.mkdir(parents=True)
+    RunLog(donor.run, Manifest.of({"name": "a", **settings}), {}, "code").write()
+    own = Manifest.of({"name": "b", **settings, "visualize": {"samples": 6}})
+    take_over([donor.run], own)
+    assert SceneFiles(tmp_path / "b", "P").poses_dir.is_dir()
 
 
 def test_a_run_takes_over_what_is_made_before_the_swept_stage(tmp_path: Path) -> None:

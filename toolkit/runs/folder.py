@@ -180,6 +180,7 @@ class RunLog:
     def write(self) -> None:
         """Write the current state to `run.json`."""
         rows = self.all_rows()
+        as_taken = self.manifest.model_copy(update={one: self.manifest.stage(one) for one in self.manifest.stages})
         work = sum(row.get("work_seconds", 0.0) for row in rows if row["status"] == "done")
         content = {
             "name": self.manifest.name,
@@ -189,7 +190,7 @@ class RunLog:
             "failed": failures(rows),
             "created": self.created,
             "pid": os.getpid(),
-            "manifest": self.manifest.model_dump(mode="json", exclude_none=True),
+            "manifest": as_taken.model_dump(mode="json", exclude_none=True),
             "versions": _versions(),
             "machine": machine(),
             "code": self.code,

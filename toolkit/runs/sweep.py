@@ -102,8 +102,7 @@ def take_over(donors: Sequence[Path], own: Manifest) -> None:
         if donor is None or mine.root.exists():
             continue
         theirs = SceneFiles(donor, scene)
-        made = {theirs.of_stage(stage) for stage in TAKEN[: shared[donor]]}
-        for source in {*theirs.caches} | made:
+        for source in {*theirs.caches, *(theirs.of_stage(stage) for stage in TAKEN[: shared[donor]])}:
             if source is not None and source.is_dir():
                 link_folder(source, mine.root / source.name)
 
