@@ -89,3 +89,16 @@ def test_a_map_by_itself_localizes_as_a_run_with_queries(small_capture: Path, tm
     np.testing.assert_allclose(poses, pair.poses[rows], atol=1e-12)
     assert len(run.queries) == 0  # of the run as it was opened
     assert len(Run.open(folder).queries) == len(pair.table)
+
+
+def test_the_best_query_has_a_pose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poses by networks have no inliers; the first row was taken, whatever its status."""
+    rows = [("a.jpg", "failed: undecided", 0), ("b.jpg", "low_confidence: rivals", 0), ("c.jpg", "ok", 0)]
+    table = pd.DataFrame(rows, columns=["image", "status", "num_inliers"]).assign(map_device="ios", scene="PLACE")
+    monkeypatch.setattr(Run, "queries", table)
+    monkeypatch.setattr(Run, "scenes", ["PLACE"])
+    monkeypatch.setattr(Run, "__getitem__", lambda _, name: name)
+    assert Run(tmp_path).best_query("ios") == "c.jpg"
+    monkeypatch.setattr(Run, "queries", table.iloc[:1])
+    with pytest.raises(ArtifactError):
+        Run(tmp_path).best_query("ios")

@@ -14,7 +14,7 @@ from toolkit.errors import COMMAND, ArtifactError
 from toolkit.files import SceneFiles, pair_devices, read_json, relative_url, why_older
 from toolkit.geometry import Ints
 from toolkit.pose.base import Query
-from toolkit.pose.result import QueryResult, statuses
+from toolkit.pose.result import QueryResult, Status, statuses
 from toolkit.results.opening import SESSIONS_ROOT, how_localized, localized_scenes, no_such_run, opened_by
 from toolkit.results.pair import PairResults, find_query, pairs_of
 from toolkit.runs.folder import RECORD
@@ -128,16 +128,19 @@ class Run:
         return WorstQueries(poses, map_device=map_device or "all").look(name).result
 
     def best_query(self, map_device: str, scene: str | None = None) -> Query:
-        """Return the query that was localized in a map with the most inliers.
+        """Return the query that was localized in a map: an `ok` one if there is any, with the most inliers.
 
         Raises:
             ArtifactError: no query was localized in the map.
         """
         queries = self.queries
         of_map = queries[(queries["map_device"] == map_device) & (queries["scene"] == self._scene(scene))]
+        of_map = of_map[statuses(of_map["status"]) != str(Status.FAILED)]
         if not len(of_map):
             raise ArtifactError(f"{self.path}: no query was localized in the map of {map_device!r}.")
-        return self[str(of_map["image"].iloc[int(of_map["num_inliers"].argmax())]).partition(";")[0]]
+        sure = statuses(of_map["status"]) == str(Status.OK)  # poses by networks have no inliers
+        best = of_map.assign(sure=sure).sort_values(["sure", "num_inliers"], ascending=False, kind="stable")
+        return self[str(best["image"].iloc[0]).partition(";")[0]]
 
     def report(self) -> "Page":
         """Return a link to the report, as a notebook shows it.
