@@ -168,7 +168,7 @@ def test_a_rig_of_folders(small_capture: Path, tmp_path: Path) -> None:
 def test_rigs_that_are_none(photographs: Path, tmp_path: Path) -> None:
     config = tmp_path / "rig.json"
     single = '[{"cameras": [{"image_prefix": "a/", "ref_sensor": true}]}]'
-    for text, message in (("{", "COLMAP reads"), (single, "two cameras")):
+    for text, message in (("{", "COLMAP reads"), ('[{"cameras": 3}]', "COLMAP reads"), (single, "two cameras")):
         config.write_text(text)
         with pytest.raises(CaptureError, match=message):
             reconstruct([photographs], tmp_path / "PLACE", rig=config)

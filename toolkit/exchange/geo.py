@@ -115,7 +115,8 @@ def export_exif(
     table = geo_table(run, capture)
     table = table.assign(sure=statuses(table["status"]) == str(Status.OK))
     table = table[table["latitude_deg"].notna() & (table["sure"] | unsure)]
-    table = table.sort_values("position_std_m").sort_values(["sure", "num_inliers"], ascending=False, kind="stable")
+    best_first = ["sure", "num_inliers", "position_std_m"]
+    table = table.sort_values(best_first, ascending=[False, False, True], kind="stable")
     table = table.drop_duplicates(["scene", "image"])
     if not len(table):
         raise ArtifactError(f"{run}: no query has a pose that is sure. Take the others by --unsure.")

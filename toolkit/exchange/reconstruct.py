@@ -445,7 +445,8 @@ def reconstruct(
     if not photographs:
         raise CaptureError(f"{sources[0]}: no photograph can be read. First: {next(iter(unreadable.items()))}")
     cameras = dict.fromkeys((item.name for item in photographs), given) if given is not None else {}
-    cameras |= _of_photographs(read_intrinsics(Path(table)), photographs, table) if table is not None else {}
+    tabled = _of_photographs(read_intrinsics(Path(table)), photographs, table) if table is not None else {}
+    cameras |= tabled
     prior = read_poses(Path(poses_prior), "world_from_cam")[1] if poses_prior is not None else {}
     prior = {name: pose @ AXES[axes] for name, pose in prior.items()}
     prior = _of_photographs(prior, photographs, poses_prior) if prior else prior
@@ -482,7 +483,8 @@ def reconstruct(
         if name in images:
             image, known_focal = images[name], work.cameras[number].has_prior_focal_length
             origin = f"estimated, started at {'EXIF' if known_focal else f'{FOCAL_PRIOR} times the longer side'}"
-            origin = f"given by {'--camera' if table is None else '--table'}" if number in work.known else origin
+            if number in work.known:
+                origin = f"given by {'--table' if item.name in tabled else '--camera'}"
             add_posed(draft, item, image, sensors[image.camera_id], origin)
     draft.rows += [{"image": name, "status": reason} for name, reason in _reasons(work, models).items()]
     sizes, error_px = [each.num_reg_images() for each in models], model.compute_mean_reprojection_error()

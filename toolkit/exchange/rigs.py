@@ -27,7 +27,7 @@ def read_rigs(rig: str | Path, photographs: Sequence[Photograph]) -> Prefixes:
     else:
         try:
             configs = pycolmap.read_rig_config(rig)
-        except RuntimeError as error:
+        except (RuntimeError, ValueError) as error:
             raise CaptureError(f"{rig}: no configuration of rigs that COLMAP reads ({error}).") from None
         cameras = [sorted(config.cameras, key=lambda camera: not camera.ref_sensor) for config in configs]
         found = [[camera.image_prefix for camera in each] for each in cameras]
