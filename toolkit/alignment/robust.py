@@ -119,9 +119,9 @@ def robust_mean_pose(world_from_cams: ArrayLike, covariances: ArrayLike) -> Pose
     """Return the robust mean of pose hypotheses on SE(3), and its covariance.
 
     The hypotheses are taken as independent. The start is the hypothesis closest to all of them. Iteratively reweighted
-    least squares in its tangent space refine it, with Huber weights within the gate and 0 beyond. Raise AlignmentError
-    if there is no hypothesis, a shape is wrong, a matrix is not a rigid pose, or a covariance is not positive definite;
-    gives the index.
+    least squares in its tangent space refine it, with Huber weights within the gate and 0 beyond. Raise AlignmentError,
+    with the index, if there is no hypothesis, a shape is wrong, a matrix is not a rigid pose, or a covariance is not
+    positive definite.
 
     Args:
         world_from_cams: (H, 4, 4); hypotheses that are not finite are left out.

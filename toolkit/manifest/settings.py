@@ -501,7 +501,7 @@ class PnpSettings(Settings):
     ransac_max_error_deg: PositiveNumber = 0.45
     """Largest reprojection error of an inlier, degrees."""
     max_error_deg: PositiveNumber = 0.17
-    """Largest reprojection error of a guided match, degrees."""
+    """Largest reprojection error of a match that agrees with the final pose, guided or not, degrees."""
     min_inliers: Positive = 12
     """Smallest number of independent inliers, among the matches found without guidance, of a pose; with fewer, the
     query has no pose."""

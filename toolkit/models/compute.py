@@ -117,7 +117,7 @@ def linear(x: "torch.Tensor", weight: "torch.Tensor", bias: "torch.Tensor | None
     """Return `torch.nn.functional.linear(x, weight, bias)`, through oneDNN if possible.
 
     On a CPU, torch multiplies float32 with MKL, which does not use AVX-512 on AMD processors. oneDNN, which torch uses
-    for bfloat16 and in compiled models, is then twice as fast.
+    for bfloat16, is then twice as fast.
 
     Args:
         x, weight, bias: of one data type; `weight` is contiguous, or the transpose of a contiguous matrix.
