@@ -213,11 +213,11 @@ def _read_errors(folder: Path, record: Mapping[str, Any]) -> pd.DataFrame:
         except (OSError, ValueError, OverflowError) as error:
             raise ArtifactError(f"{path}: not a table of errors ({error}). Run its stage evaluate again.") from None
         lacking = [name for name in (*QUERY[1:], "image", *_RESULT) if name not in table]
-        if not lacking and table[_ERRORS].notna().any(axis=None):
-            lacking = [] if any(name.startswith("loss@") for name in table) else ["loss@<threshold>"]
+        has_losses = any(name.startswith("loss@") for name in table)
+        if not lacking and not has_losses and table[_ERRORS].notna().any(axis=None):
+            lacking = ["loss@<threshold>"]
         if lacking:
-            name = lacking[0]
-            raise ArtifactError(f"{path}: column {name!r} is missing. Run its stage evaluate again.")
+            raise ArtifactError(f"{path}: column {lacking[0]!r} is missing. Run its stage evaluate again.")
         tables.append(table.assign(scene=scene))
     if not tables:
         missing = f"{next(iter(paths.values()))} is missing" if paths else "its run.json names no scene"

@@ -135,11 +135,11 @@ class Run:
         """
         queries = self.queries
         of_map = queries[(queries["map_device"] == map_device) & (queries["scene"] == self._scene(scene))]
-        of_map = of_map[statuses(of_map["status"]) != str(Status.FAILED)]
+        status = statuses(of_map["status"])
+        of_map = of_map.assign(sure=status == str(Status.OK))[status != str(Status.FAILED)]
         if not len(of_map):
             raise ArtifactError(f"{self.path}: no query was localized in the map of {map_device!r}.")
-        sure = statuses(of_map["status"]) == str(Status.OK)  # poses by networks have no inliers
-        best = of_map.assign(sure=sure).sort_values(["sure", "num_inliers"], ascending=False, kind="stable")
+        best = of_map.sort_values(["sure", "num_inliers"], ascending=False, kind="stable")  # networks have no inliers
         return self[str(best["image"].iloc[0]).partition(";")[0]]
 
     def report(self) -> "Page":
