@@ -14,6 +14,8 @@ Bools = NDArray[np.bool_]
 
 NOISE_FACTOR = np.log(2.5)  # standard deviation of the log-normal prior of the noise, as a logarithm
 _LEVELS = np.exp(np.linspace(-3.5, 3.5, 29))  # ratios of actual to expected noise, integrated over
+_GATE = 3.0  # standard deviations per axis; hypotheses further from the mean are outliers
+_TOO_SMALL = 2.0  # factor by which stated standard deviations are often too small
 
 
 class AlignmentError(ToolkitError):
@@ -94,10 +96,6 @@ def checked_weights(weights: ArrayLike | None, count: int) -> Floats:
 def listed(chosen: Bools) -> str:
     """Return the chosen indices as text for a message."""
     return ", ".join(str(index) for index in np.flatnonzero(chosen))
-
-
-_GATE = 3.0  # standard deviations per axis; hypotheses further from the mean are outliers
-_TOO_SMALL = 2.0  # factor by which stated standard deviations are often too small
 
 
 @dataclass(frozen=True)

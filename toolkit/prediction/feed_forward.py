@@ -33,6 +33,14 @@ NEAR_DUPLICATE = 0.03  # baseline over depth; below, two images are near-duplica
 LEAST_SIMILARITY = 0.25  # similarity of the worst candidate, where that of the best one is 1
 ALL_SHARED = 50  # shared points from which two images count as fully covisible
 _LAST = 1e-3  # factor that puts near-duplicates and images without shared view last
+FOCAL_TOLERANCE = 0.2
+"""Difference between the log focal length ratios (predicted over stated) of query and references above which the stated
+focal length is wrong; several times the usual error of the networks."""
+MAX_DEPTH_POINTS = 200
+"""Largest number of map points per reference whose depth is compared with the prediction; those with the longest tracks
+are used."""
+MIN_POINTS = 20
+"""If a reference sees fewer map points, its depth map in the capture is used instead, if there is one."""
 
 
 def select_references(
@@ -103,16 +111,6 @@ def _shared_view(world_from_cams: Floats, cameras: Sequence[pycolmap.Camera], de
     cams_from_world = geometry.invert(world_from_cams)
     seen = np.stack([in_view(geometry.transform(cams_from_world, p[None]), bounds).mean(axis=1) for p in points])
     return (seen + seen.T) / 2
-
-
-FOCAL_TOLERANCE = 0.2
-"""Difference between the log focal length ratios (predicted over stated) of query and references above which the stated
-focal length is wrong; several times the usual error of the networks."""
-MAX_DEPTH_POINTS = 200
-"""Largest number of map points per reference whose depth is compared with the prediction; those with the longest tracks
-are used."""
-MIN_POINTS = 20
-"""If a reference sees fewer map points, its depth map in the capture is used instead, if there is one."""
 
 
 @dataclass(frozen=True)
