@@ -497,6 +497,34 @@ def test_a_sure_pose_asks_for_nothing_more(
     assert pd.read_csv(run.poses_txt("ios", "ios").with_suffix(".csv"))["first_status"].isna().all()
 
 
+@pytest.mark.parametrize(("sure_m", "asked"), [(1.0, 1), (0.0, 2)])
+def test_an_ok_pose_that_is_not_precise_asks_the_references_that_support_it_before_all(
+    small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch, sure_m: float, asked: int
+) -> None:
+    """A query asks few references; all only if it is still unsure. The deviations of the first poses count as large."""
+    add_other_kind(monkeypatch)
+    monkeypatch.setattr(maps, "FEW_REFERENCES", 2)
+    with_other = lambda result: result.found_by.endswith("other")  # noqa: E731
+    unsure = lambda _, result: result.position_std > (sure_m if with_other(result) else 0)  # noqa: E731
+    monkeypatch.setattr(maps.Map, "is_unsure", unsure)
+    counts, match = list[int](), maps.OnDemandLocalizer.match
+
+    def counted(self: Any, query: Query, references: Sequence[References]) -> Any:
+        counts.append(sum(len(found.images) for found in references))
+        return match(self, query, references)
+
+    monkeypatch.setattr(maps.OnDemandLocalizer, "match", counted)
+    table = run_stage(small_capture, run, query_device="ios", features=ESCALATES["features"])
+    queries, rounds = table["queries"].item(), sorted(counts)
+    assert table["escalated"].item() == table["ok"].item() == queries
+    assert len(rounds) == asked * queries
+    assert rounds[:queries] == [2] * queries
+    assert all(count > 2 for count in rounds[queries:])
+    rows = rows_of(run, "ios")
+    assert (rows["method"] == "pnp+other").all()
+    assert run_stage(small_capture, run, query_device="ios", features=ESCALATES["features"])["skipped"].all()
+
+
 @pytest.mark.slow
 def test_a_first_answer_that_is_not_bettered_stays(
     small_capture: Path, run: SceneFiles, finished: tuple[SceneFiles, pd.DataFrame], monkeypatch: pytest.MonkeyPatch

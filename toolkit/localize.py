@@ -3,7 +3,7 @@
 import json
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -50,7 +50,7 @@ from toolkit.results.metrics import camera_messages
 from toolkit.results.opening import MAPS, attributes, session_fingerprint, update_attributes
 from toolkit.results.pair import query_group
 from toolkit.runs.pairs import PairRows
-from toolkit.scene.map import WITHOUT_FEATURES, Map, create_methods, localize_image, needs_upright
+from toolkit.scene.map import FEW_REFERENCES, WITHOUT_FEATURES, Map, create_methods, localize_image, needs_upright
 from toolkit.scene.stored import StoredQueries
 from toolkit.store.hdf5 import write_groups
 from toolkit.store.items import Items, heals
@@ -238,8 +238,9 @@ _Todo = tuple[str, str, int]
 """Name of a query's item, fingerprint of its sources, and number of the query."""
 _Task = tuple[int, QueryInput, Any, float]
 """Number of a query, the query, what is known of it (a prediction, or its first result), and seconds spent on it."""
-_RETRIED = "/retried"
-"""Ends the name of a query's item with the fallback features. It has no arrays if the first correspondences count."""
+_FEW, _RETRIED = "/few", "/retried"
+"""End the names of a query's items with the fallback features, of few references and of all. They have no arrays if the
+first correspondences count."""
 
 
 class _Pair:
@@ -302,6 +303,7 @@ class _Pair:
                 "features": settings.features.model_dump(exclude={"checkpoint"}),
                 "matcher": settings.matcher.model_dump(exclude={"checkpoint"}),
                 "weights": [file_fingerprint(path) for path in weights_files(settings)],
+                "few": FEW_REFERENCES,
             }
         if stage.turns is not None:  # they follow from all maps of the capture, not only from that of this pair
             record["turns"] = stage.turns.fingerprint(sessions)
@@ -343,22 +345,21 @@ class _Pair:
         self.map = self.stage.open_map(self.devices[0])
         self.stored = StoredQueries(self.session, self.retrieval)
         if self.map.settings.method not in WITHOUT_FEATURES:
-            self._add_features(self.map.kinds, range(len(self.keys)))
+            self._add_features(self.map.kinds, {number: self.query(number)[1] for number in range(len(self.keys))})
         return self
 
-    def _add_features(self, kinds: Sequence[AnyMethod], numbers: Iterable[int]) -> None:
-        """Extract features of query images, and match them with their references if the matcher is a network; also
-        those of the references if the map has none of a kind.
+    def _add_features(self, kinds: Sequence[AnyMethod], asked: Mapping[int, Sequence[References]]) -> None:
+        """Extract features of queries, given by number with the references of each image, and match them with these if
+        the matcher is a network; also extract those of the references if the map has none of a kind.
         """
         session, scene_map, stage = self.session, self.map, self.stage
-        rows = np.unique(np.concatenate([*(self.rows[number] for number in numbers), np.zeros(0, np.int64)]))
-        images = session.images.iloc[rows]
-        keys = zip(images["timestamp"].tolist(), images["sensor_id"].tolist(), strict=True)
+        rows = np.unique(np.concatenate([*(self.rows[number] for number in asked), np.zeros(0, np.int64)]))
+        map_names = list(scene_map.index_of)
         names = [
-            (session.image_name(int(row)), name)
-            for row, key in zip(rows, keys, strict=True)
-            for name, _ in self.stored.references.get(key, [])
-            if name in scene_map.index_of
+            (session.image_name(int(row)), map_names[index])
+            for number, references in asked.items()
+            for row, found in zip(self.rows[number], references, strict=True)
+            for index in found.images
         ]
         for kind in kinds:
             turns = scene_map.turns_of(kind, session)
@@ -388,20 +389,16 @@ class _Pair:
             todo = items.left((name, source, number) for name, number in numbers.items())
             faulty = self._spread(items, todo)
             if self.map.fallback is not None:
-                items.flush()
-                retried = [
-                    (name + _RETRIED, source, number) for name, number in numbers.items() if number not in faulty
-                ]
-                todo = [
-                    one
-                    for one in items.left(retried)
-                    if self.map.is_unsure(first := self._first(items, one))
-                    and self.map.needs_fallback(*self.query(one[2]), first)
-                ]
-                if todo:
-                    started = time.perf_counter()
-                    self.add_fallback(todo)
-                    faulty |= self._spread(items, todo, (time.perf_counter() - started) / len(todo))
+                for end in (_FEW, _RETRIED):
+                    items.flush()
+                    # The other queries have no features of the fallback.
+                    del self.stored.stores[len(self.map.kinds) :], self.stored.matches[len(self.map.kinds) :]
+                    retried = [(name + end, source, number) for name, number in numbers.items() if number not in faulty]
+                    todo = [one for one in items.left(retried) if self._is_open(items, one)]
+                    if todo:
+                        started = time.perf_counter()
+                        self.add_fallback(items, todo)
+                        faulty |= self._spread(items, todo, (time.perf_counter() - started) / len(todo))
         # If the run is killed before it writes the new poses, no poses of an earlier run may lie beside this file.
         for poses in (self.file("txt"), sidecar_path(self.file("txt"))):
             poses.unlink(missing_ok=True)
@@ -412,7 +409,8 @@ class _Pair:
                 if number in faulty:
                     row, arrays = faulty[number].to_row(*self.keys[number]), faulty[number].arrays()
                 else:
-                    last = name + _RETRIED * items.is_current(name + _RETRIED, source)
+                    ends = (end for end in (_RETRIED, _FEW) if items.is_current(name + end, source))
+                    last = name + next(ends, "")
                     row, arrays = items.note(last), items[last] or items[name]
                 rows[name] = row | {key: arrays[key] for key in ("world_from_rig", "covariance")}
                 yield name, arrays
@@ -427,14 +425,29 @@ class _Pair:
         todo = items.spread(_do_share, todo, arguments, self.label, "query", 1 if retry_s else size)
         return self.localize_into(items, todo, *retry_s)
 
-    def _first(self, items: Items, todo: _Todo) -> QueryResult:
-        """Return the stored result of a query from the features that every query has."""
-        name = todo[0].removesuffix(_RETRIED)
-        return QueryResult.from_arrays(items[name]).with_row(items.note(name))
+    def _stored(self, items: Items, todo: _Todo, end: str = "") -> QueryResult:
+        """Return the stored result of a query: from the features that every query has, or of a retry."""
+        name = todo[0].removesuffix(_FEW).removesuffix(_RETRIED)
+        return QueryResult.from_arrays(items[name + end] or items[name]).with_row(items.note(name + end))
 
-    def add_fallback(self, todo: Sequence[_Todo]) -> None:
+    def _is_open(self, items: Items, todo: _Todo) -> bool:
+        """Tell whether a query should be retried with few references, or with all; see `Map.rounds`."""
+        first = self._stored(items, todo)
+        if not self.map.is_unsure(first) or not self.map.needs_fallback(*(query := self.query(todo[2])), first):
+            return False
+        if todo[0].endswith(_FEW):
+            return len(self.map.rounds(query[1], first)) > 1
+        few = items.is_current(todo[0].removesuffix(_RETRIED) + _FEW, todo[1])
+        return not few or self.map.is_unsure(self._stored(items, todo, _FEW))
+
+    def _retried(self, items: Items, todo: _Todo) -> tuple[Query, Sequence[References], QueryResult]:
+        """Return a query that is retried, the references that it asks, and its first result."""
+        first, (query, references) = self._stored(items, todo), self.query(todo[2])
+        return query, self.map.rounds(references, first)[0 if todo[0].endswith(_FEW) else -1], first
+
+    def add_fallback(self, items: Items, todo: Sequence[_Todo]) -> None:
         """Extract and match the fallback features of queries."""
-        self._add_features(self.map.escalation, [number for _, _, number in todo])
+        self._add_features(self.map.escalation, {one[2]: self._retried(items, one)[1] for one in todo})
 
     def localize_into(
         self, items: Items, todo: Sequence[_Todo], retry_s: float | None = None
@@ -445,14 +458,18 @@ class _Pair:
         With `retry_s`, retry unsure queries with the fallback features, whose extraction took these seconds per query;
         an item gets arrays only if the result is better.
         """
-        faulty = dict[int, QueryResult]()
+        faulty, firsts = dict[int, QueryResult](), dict[int, QueryResult]()
         of_number = {number: (name, source) for name, source, number in todo}
-        firsts = {} if retry_s is None else {one[2]: self._first(items, one) for one in todo}
+
+        def retried() -> Iterator[_Task]:
+            for one in todo:
+                query, references, firsts[one[2]] = self._retried(items, one)
+                yield one[2], (query, references), firsts[one[2]], retry_s or 0.0
+
         if retry_s is None:
             results = self._run(self._locate, self._predicted(list(of_number)), len(todo))
         else:
-            tasks = ((number, self.query(number), firsts[number], retry_s) for number in of_number)
-            results = self._run(self.map.retry, tasks, len(todo))
+            results = self._run(self.map.retry, retried(), len(todo))
         for number, result in results:
             if result.is_internal:
                 faulty[number] = result
@@ -501,7 +518,7 @@ def _do_share(
 ) -> None:
     pair = _Pair(stage, map_device, query_device).open()
     if retry_s:
-        pair.add_fallback(todo)
+        pair.add_fallback(items, todo)
     pair.localize_into(items, todo, *retry_s)
 
 

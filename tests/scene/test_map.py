@@ -95,6 +95,21 @@ def test_more_features_are_asked_where_a_pose_is_not_sure(
         assert [len(kinds) for kinds in further.asked[0].features] == [2]
 
 
+def test_an_ok_pose_asks_the_references_that_support_it_first() -> None:
+    scene_map = scripted_map(Scripted(), Scripted(), [])
+    vars(scene_map)["index_of"] = {"a": 0, "b": 1, "c": 2, "d": 3, "e": 4, "f": 5}
+    references = [References.of([5, 4, 3, 2, 1, 0]), References.of([4, 5])]
+    vague = replace(VAGUE, references=("c", "a", "b", "f", "d"))
+
+    def asked(first: QueryResult) -> list[list[list[int]]]:
+        return [[found.images.tolist() for found in part] for part in scene_map.rounds(references, first)]
+
+    every = [[5, 4, 3, 2, 1, 0], [4, 5]]
+    assert asked(vague) == [[[5, 2, 1, 0], [5]], every]
+    assert asked(replace(vague, status=Status.LOW_CONFIDENCE)) == [every], "other references may show another place"
+    assert asked(VAGUE) == [every]
+
+
 def test_what_the_first_attempt_knew_of_rivals_is_judged_by_all_features() -> None:
     """More features once turned a wrong pose into ok, as they had forgotten the rival that SIFT knew."""
     scene, there, far = Scene(), np.eye(4), np.eye(4)

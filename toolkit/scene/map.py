@@ -101,6 +101,8 @@ WORTH_DEG, WORTH_LENGTHS = 0.05, 0.005
 MAX_SURE_STD_M = 0.05
 """An `ok` pose with at most this standard deviation of the position, meters, is precise enough. Otherwise the fallback
 features are used too."""
+FEW_REFERENCES = 4
+"""How many references, those that support an `ok` pose most, fallback features are matched with at first."""
 MAX_KNOWN = 3
 """Largest number of earlier poses of a query that the fallback features judge, too."""
 
@@ -352,9 +354,14 @@ class Map:
         priors = [] if near is None else [self._prior(near, references)]
         result = self.solve(query, self.match(query, references), prediction, priors)
         result = replace(result, seconds=time.perf_counter() - started)
-        if fallback and self.needs_fallback(query, references, result):
-            return self.retry(self._with_fallback_features(query), references, result, priors)
-        return result
+        if not fallback or not self.needs_fallback(query, references, result):
+            return result
+        query, first = self._with_fallback_features(query), result
+        for asked in self.rounds(references, first):
+            result = self.retry(query, asked, first, priors)
+            if not self.is_unsure(result):
+                break
+        return replace(result, seconds=time.perf_counter() - started)
 
     def predict(self, queries: Sequence[QueryInput]) -> list[Any]:
         """Return a network's prediction for each query, for `locate`; see `Localizer.predict`."""
@@ -374,6 +381,17 @@ class Map:
         return self.is_unsure(result) and any(
             not isinstance(features, str) and len(found.images) for features, found in readable
         )
+
+    def rounds(self, references: Sequence[References], first: QueryResult) -> list[Sequence[References]]:
+        """Return the references that fallback features are matched with, in turn until the pose is sure.
+
+        An `ok` pose only lacks precision, so the references that support it most are asked before all are.
+        """
+        if first.status is not Status.OK:
+            return [references]
+        best = [self.index_of[name] for name in first.references[:FEW_REFERENCES]]
+        few = [found.take(np.isin(found.images, best)) for found in references]
+        return [few, references] if any(len(found.images) for found in few) else [references]
 
     @fixed_sums
     def retry(
