@@ -306,7 +306,7 @@ def new(
     out: Annotated[Path, Option(help="Folder of the manifest.")] = Path("data_manifests"),
 ) -> None:
     """Write a manifest for a capture, with explanations and the findings of `check`."""
-    from toolkit.exchange.new_manifest import new_manifest
+    from toolkit.exchange.import_report import new_manifest
 
     path = new_manifest(name, capture, out)
     print(f"Manifest: {path}\nRun it: {COMMAND} run {path}")
@@ -489,7 +489,7 @@ def import_dataset(
 ) -> Any:
     """Make a map and queries from a data set of the field, and a manifest with its thresholds."""
     from toolkit.exchange.datasets import LAYOUTS, import_dataset
-    from toolkit.exchange.new_manifest import new_manifest
+    from toolkit.exchange.import_report import new_manifest
     from toolkit.manifest import nearest
     from toolkit.synthetic.photographs import KINDS, SCENES, THRESHOLDS, arrange
 
@@ -549,9 +549,8 @@ def reconstruct(
     """
     from toolkit import pipeline
     from toolkit.capture import Capture
-    from toolkit.exchange.grow import add_recording, remove_recording
-    from toolkit.exchange.new_manifest import new_manifest
-    from toolkit.exchange.reconstruct import FOLDER, reconstruct
+    from toolkit.exchange.import_report import new_manifest
+    from toolkit.exchange.reconstruct import FOLDER, add_recording, reconstruct, remove_recording
     from toolkit.figures.explore import draw_top_view
 
     if (len(sources) != 1) if remove else (len(sources) < 2):

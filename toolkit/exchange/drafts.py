@@ -26,13 +26,12 @@ import PIL.Image
 import pycolmap
 
 from toolkit.capture import RAW_DATA, Session, Trajectory, parse_camera, write_session
-from toolkit.capture.cameras import camera_text, invertible_share
-from toolkit.capture.devices import SPLITS
-from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.images import (
     NO_FILE,
     ORIENTATION,
+    camera_text,
     find_mask,
+    invertible_share,
     is_file,
     read_header,
     read_number,
@@ -40,10 +39,10 @@ from toolkit.capture.images import (
     time_taken,
     zone_of,
 )
-from toolkit.capture.names import EXPECTED_NAME, has_long_part, is_bad_name, is_linked_here, note_linked_here
-from toolkit.capture.tables import COLUMNS, write_table
+from toolkit.capture.names import EXPECTED_NAME, SPLITS, has_long_part, is_bad_name, is_linked_here, note_linked_here
+from toolkit.capture.session import IMPORT_RECORD
+from toolkit.capture.tables import COLUMNS, read_depth, write_depth, write_table
 from toolkit.capture.upright import up_of_cameras
-from toolkit.capture.writing import read_depth, write_depth
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.georeference import alignment, gps_position, quarter_turns, read_positions
 from toolkit.exchange.import_report import ImportReport, cameras_of, grouped

@@ -20,13 +20,12 @@ import pandas as pd
 
 from toolkit.capture import COLUMNS, Capture, Trajectory
 from toolkit.capture.check import UNIT_TOLERANCE
-from toolkit.capture.devices import SPLITS, extra_devices
-from toolkit.capture.names import allow_outside
+from toolkit.capture.names import SPLITS, allow_outside, extra_devices
 from toolkit.capture.tables import read_table
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
 from toolkit.files import SceneFiles, pair_name, read_references, require_current, write_atomic
 from toolkit.geometry import Floats, invert, qt_from_pose, unit
-from toolkit.pose.result import Status
+from toolkit.pose.base import Status
 from toolkit.results.pair import PairResults
 
 FAILED = ("nearest", "leave-out")
