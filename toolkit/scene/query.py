@@ -429,13 +429,17 @@ class ReferenceSearch:
             turned, side = shows_upright(embedder, self.embed_settings.upright), embedder.least_side
             images = (turn_image(view.read(True, side), view.turns if turned else 0) for view in query.views)
             return [embedder.prepare(image) for image in images]
-        sift, settings = SiftExtractor(), [kind.extractor.settings for kind in kinds]
+        sift, settings = self._sift, [kind.extractor.settings for kind in kinds]
         if query.features and sift.settings in settings:  # the embedder can use the features of the localizer
             at = settings.index(sift.settings)
             return [features[at] for features in query.features if not isinstance(features, str)]
         extracted = sift.extract([view.read(color=False) for view in query.views])
         views = zip(extracted, query.views, strict=True)
         return [usable(features, view.mask, view.camera) for features, view in views]
+
+    @cached_property
+    def _sift(self) -> SiftExtractor:
+        return SiftExtractor()
 
     def find(
         self, query: Query, k: int | None = None, allowed: Sequence[NDArray[np.bool_] | None] = ()
