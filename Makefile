@@ -43,7 +43,7 @@ test-kernels: $(INSTALLED)  ## run the tests of numbers with other BLAS kernels 
 	OPENBLAS_CORETYPE=$${run% *} OPENBLAS_NUM_THREADS=$${run#* } $(PYTEST) tests/test_localize.py tests/test_geometry.py \
 	$(addprefix tests/,features embedders alignment mapping pose prediction scene sequences) \
 	$(addsuffix .py,$(addprefix --ignore=tests/,features/test_aliked features/test_lightglue \
-	features/test_superpoint prediction/test_network_predictor scene/test_inspection scene/test_located)); done
+	features/test_superpoint prediction/test_network scene/test_inspection scene/test_query)); done
 
 # All tests of a kind, default and slow. Together the three have every test that needs neither a browser nor a GPU.
 test-numbers: $(INSTALLED)  ## test what is computed: features, maps, poses, networks, errors, accuracy on captures

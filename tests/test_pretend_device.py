@@ -16,7 +16,7 @@ from tests.models import test_da3 as da3
 from tests.models import test_omega as omega
 from tests.models.test_megaloc import tiny_megaloc
 from tests.models.test_vggt import tiny
-from tests.prediction.test_network_predictor import HIGHER, WIDE, Photographs, assert_same
+from tests.prediction.test_network import HIGHER, WIDE, Photographs, assert_same
 from tests.pretend import DEVICE, PretendTensor, pretending, resolved
 from toolkit.capture.masks import Masks
 from toolkit.embedders import megaloc, search

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -19,8 +19,6 @@ from toolkit.capture import Capture, Session
 from toolkit.capture.names import in_order
 from toolkit.errors import COMMAND, OF_THE_DATA, ArtifactError, ToolkitError
 from toolkit.features.stores import FeatureStore, MatchStore, features_path
-from toolkit.figures.answers import Answer
-from toolkit.figures.query_images import shown_name
 from toolkit.files import (
     SceneFiles,
     image_name,
@@ -50,6 +48,9 @@ from toolkit.results.pair import (
 from toolkit.runs.folder import RECORD
 from toolkit.runs.kernel import TEXT_BARS
 from toolkit.scene.map import WITHOUT_FEATURES, Map
+
+if TYPE_CHECKING:
+    from toolkit.figures.answers import Answer
 from toolkit.scene.query import Located, best_ranks
 
 WORST = "worst"
@@ -157,7 +158,7 @@ class InspectedPair:
     def __len__(self) -> int:
         return len(self.names)
 
-    def look(self, query: int | str = 0) -> Answer:
+    def look(self, query: int | str = 0) -> "Answer":
         """Return a query with the stored results of the localize stage, by its number, the name of one of its images
         (or a unique end of the name), or `worst`. Raise ArtifactError if no query matches, or several do (the nearest
         is named), or its stored results are damaged.
@@ -170,7 +171,9 @@ class InspectedPair:
         context = Located(partial(self._answer, number), partial(self._open, number))
         return self._answer(number, replace(self.localized.results[number], context=context))
 
-    def _answer(self, number: int, result: QueryResult) -> Answer:
+    def _answer(self, number: int, result: QueryResult) -> "Answer":
+        from toolkit.figures.answers import Answer
+
         pair, true = self.localized, self.localized.true_poses[number]
         return Answer(
             *(result, self.settings, *pair.views(number), pair.map_session, pair.local_map, pair.results.unit),
@@ -242,6 +245,8 @@ class WorstQueries:
         tables = [pair.localized.localizations.errors for pair in pairs]
         order = worst_first(pd.concat(tables, ignore_index=True)).tolist() if queries else []
         self._queries = [queries[k] for k in order]
+        from toolkit.figures.query_images import shown_name
+
         self.names = [f"{pair.label}: {shown_name(pair.names[number])}" for pair, number in self._queries]
 
     def table(self, most: int = 12) -> pd.DataFrame:
@@ -254,7 +259,7 @@ class WorstQueries:
             rows.append({**pair.localized.localizations.errors.iloc[number].to_dict(), **devices})
         return pd.DataFrame(rows).reindex(columns=columns).replace(np.inf, np.nan)
 
-    def look(self, rank: int | str = 0) -> Answer:
+    def look(self, rank: int | str = 0) -> "Answer":
         """Return a query by its rank, 0 for the worst of all, or by the name of one of its images.
 
         `worst` is the worst one with matches, as those without, such as a torn file, have little to show. A query that
@@ -320,6 +325,8 @@ def choose(queries: Any, chosen: int | str = 0) -> Choice:
         display(choice.shown)
         return choice
     import ipywidgets
+
+    from toolkit.figures.query_images import shown_name
 
     at = chosen if isinstance(chosen, int) else choice.shown.number
     options = [(f"{k}: {shown_name(name)}", k) for k, name in enumerate(queries.names)]
@@ -441,8 +448,6 @@ class Run:
         Raises:
             ArtifactError: no query has this name, or several do; or its stored results are damaged.
         """
-        from toolkit.scene.run import WorstQueries
-
         poses = SceneFiles(self.path, self._scene(scene)).poses_dir
         return WorstQueries(poses, map_device=map_device or "all").look(name).result
 
