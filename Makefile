@@ -15,7 +15,7 @@ OF_KIND := $(PYTEST) -m "not browser and not gpu"
 NUMBERS := $(addprefix tests/,alignment embedders features mapping models pose prediction scene sequences synthetic \
 	$(addsuffix .py,$(addprefix test_,accuracy benchmark_reader confidence embed evaluate geometry localize \
 	references_file rerank retrieve sequence threads)))
-FAULTS := $(addprefix tests/,capture exchange fuzz store $(addsuffix .py,$(addprefix test_,damage empty_sets files kills \
+FAULTS := $(addprefix tests/,capture datasets exchange fuzz store $(addsuffix .py,$(addprefix test_,damage empty_sets files kills \
 	lineage manifest pretend_device properties stops)))
 NOTEBOOKS := $(addprefix tests/,figures report results runs viewer $(addsuffix .py,$(addprefix test_,compare_notebook \
 	docs lab notebooks own_images package pages pipeline rooms visualize)))

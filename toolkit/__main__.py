@@ -343,7 +343,7 @@ def download(
     overrides: Settings = None,
 ) -> None:
     """Download, unpack and check the captures of a manifest; resume a stopped download."""
-    from toolkit.exchange.download import download
+    from toolkit.datasets.download import download
     from toolkit.manifest import find_manifest
 
     names = [name.strip() for name in sessions.split(",") if name.strip()]
@@ -488,7 +488,7 @@ def import_dataset(
     **options: Any,
 ) -> Any:
     """Make a map and queries from a data set of the field, and a manifest with its thresholds."""
-    from toolkit.exchange.datasets import LAYOUTS, import_dataset
+    from toolkit.datasets.layouts import LAYOUTS, import_dataset
     from toolkit.exchange.import_report import new_manifest
     from toolkit.manifest import nearest
     from toolkit.synthetic.photographs import KINDS, SCENES, THRESHOLDS, arrange

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from toolkit.capture.names import allow_outside, extra_devices, table_record
+from toolkit.datasets.download import is_unfinished
 from toolkit.embedders import WEIGHTS as EMBEDDER_WEIGHTS
 from toolkit.embedders import resolve_model
 from toolkit.errors import (
@@ -32,7 +33,6 @@ from toolkit.errors import (
     require_packages,
     sentence,
 )
-from toolkit.exchange.download import is_unfinished
 from toolkit.features.matching import local_weights, resolve_auto
 from toolkit.files import (
     SceneFiles,
