@@ -56,6 +56,9 @@ _UNKNOWN: dict[str, Any] = {
 }
 
 
+# Scale from depth
+
+
 @dataclass(frozen=True)
 class ScaleEstimate:
     """A scale and its relative standard deviation."""
@@ -185,6 +188,9 @@ def _between(
     between = max(excess / (information.sum() - (information**2).sum() / information.sum()), 0.0)
     information = 1 / (1 / information + between)
     return float(information @ means / information.sum()), float(1 / information.sum())
+
+
+# Similarity
 
 
 @dataclass(frozen=True)

@@ -57,6 +57,9 @@ WIDE = ("FISHEYE", "FOV", "EUCM")  # ends of the names of models for fields of v
 _LARGEST = 2**31 - 1  # largest image side, pixels; COLMAP cannot hold larger numbers
 
 
+# Image files
+
+
 def read_file(path: str | Path) -> bytes:
     """Return the content of an image file.
 
@@ -272,7 +275,7 @@ def find_mask(image: Path, masks: Path | None = None) -> Path | None:
 def read_header(path: Path) -> tuple[tuple[int, int], dict[int, Any]]:
     """Return the stored width and height of an image, and its EXIF tags by number.
 
-    Raise ImageError if the file is missing, not an image, or has more than `images.MOST_PIXELS` pixels.
+    Raise ImageError if the file is missing, not an image, or has more than `MOST_PIXELS` pixels.
     """
     if not is_file(path):
         raise ImageError(NO_FILE)
@@ -348,6 +351,9 @@ def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
     params = [float(focal_px), width / 2, height / 2]
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
     return camera, f"a guess from EXIF ({how}), without distortion"
+
+
+# Cameras
 
 
 def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
@@ -471,6 +477,9 @@ def in_view(points_in_cams: Floats, bounds: Floats) -> NDArray[np.bool_]:
     x, y = points_in_cams[..., 0] / np.maximum(z, 1e-6), points_in_cams[..., 1] / np.maximum(z, 1e-6)
     b = bounds[:, None]
     return (z > 0.1) & (x > b[..., 0]) & (x < b[..., 1]) & (y > b[..., 2]) & (y < b[..., 3])
+
+
+# Quarter turns
 
 
 def turn_image(image: NDArray[Any], k: int) -> NDArray[Any]:

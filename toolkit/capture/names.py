@@ -114,6 +114,9 @@ def _color_of_other(key: str) -> str:
     return _FURTHER_COLORS[zlib.crc32(key.encode()) % len(_FURTHER_COLORS)]
 
 
+# Names and links
+
+
 def outside_allowed() -> bool:
     """Tell whether images may lie outside of the capture."""
     return os.environ.get(ALLOW_OUTSIDE) == "1"

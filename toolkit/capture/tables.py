@@ -344,6 +344,9 @@ def write_table(path: Path, header: str | None, rows: Iterable[str]) -> None:
         stream.writelines(f"{row}\n" for row in rows)
 
 
+# Poses of devices
+
+
 class Trajectory:
     """Poses of devices over time, world_from_device.
 
@@ -453,6 +456,9 @@ class Trajectory:
         poses = np.full((len(rows), 4, 4), np.nan)
         poses[rows >= 0] = pose_from_qt(self.qt[rows[rows >= 0]])
         return poses
+
+
+# The files of a session
 
 
 def write_session(

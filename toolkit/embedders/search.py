@@ -58,6 +58,9 @@ _Best = Callable[[_Floats, int, int], Found]
 from the start of the block."""
 
 
+# Vectors on disk
+
+
 @dataclass(frozen=True)
 class StoredVectors:
     """One descriptor of images: selected rows of `.npy` matrices that are concatenated along axis 0."""
@@ -252,6 +255,9 @@ def load_embeddings(folder: str | Path) -> tuple[NDArray[np.float32], pd.DataFra
     """Read the embeddings (N, D) float32 of a session, or of one subsession, into memory; see `open_embeddings`."""
     vectors, table = open_embeddings(folder)
     return vectors[:], table
+
+
+# Indexes
 
 
 @dataclass(frozen=True)
@@ -449,6 +455,9 @@ def _train_pca(pca: Any, rows: NDArray[np.float32]) -> None:
 
 
 _Vectors = NDArray[Any] | Vectors
+
+
+# Search
 
 
 def search(

@@ -335,6 +335,9 @@ def session_of_run(run: str | Path, scene: str, session_id: str, capture: str | 
         return capture_of(scene)[session_id]
 
 
+# Features and matches of hloc
+
+
 def export_features(run: str | Path, scene: str, session: str, out: str | Path, kind: str = "sift") -> int:
     """Write the features of a session, such as `ios_map`, as a file of hloc, and return the number of images.
 
@@ -478,6 +481,9 @@ def _opened(path: Path) -> h5py.File:
         return h5py.File(path, "r")
     except OSError as error:
         raise ArtifactError(f"{path} cannot be read as HDF5 ({first_line(error)}).") from None
+
+
+# Results on the Earth
 
 
 def geo_table(run: str | Path, capture: str | Path | None = None) -> pd.DataFrame:

@@ -128,6 +128,9 @@ def cameras_of(images: Iterable[tuple[str, pycolmap.Camera, str]]) -> list[dict[
     ]  # fmt: skip
 
 
+# The manifest of a new capture
+
+
 def new_manifest(
     name: str, capture: str | Path | None = None, folder: str | Path = "data_manifests",
     thresholds: Sequence[tuple[float, float]] = (),

@@ -500,6 +500,9 @@ def _read_hloc_list(text: str) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["image", *_CAMERA_COLUMNS, "line"])
 
 
+# transforms.json
+
+
 def import_transforms(
     path: str | Path, capture: str | Path, device: str = "ios", split: str = "map", undo_applied: bool = False,
     own_split: bool = True, **options: Any,
@@ -510,7 +513,7 @@ def import_transforms(
     image; ManifestError as for `drafts.start`.
 
     Args:
-        capture, device, split: as for `interchange.import_colmap`.
+        capture, device, split: as for `import_colmap`.
         undo_applied: return to the world before `applied_transform` and `applied_scale`, as of the COLMAP model that
             the file was made from.
         own_split: without `hold_out`, the images of a map that the file names in `test_filenames` and `val_filenames`
@@ -520,13 +523,13 @@ def import_transforms(
     path = Path(path)
     options.setdefault("axes", "opengl")
     draft = start(capture, device, split, path.parent, **options)
-    content = _read(path)
+    content = _read_transforms(path)
     held = _named(content, "val_filenames", "test_filenames")
     own_split = own_split and bool(held) and split == "map" and not draft.hold_out
-    frames: dict[str, _Frame] = {}
+    frames: dict[str, _TransformsFrame] = {}
     applied = _applied(path, content)
     for number, entry in enumerate(content["frames"]):
-        frame = _Frame(path, number, entry, content)
+        frame = _TransformsFrame(path, number, entry, content)
         if frame.name in frames:
             raise frame.error("file_path", f"that of frame {frames[frame.name].number} again", "one frame per image")
         frames[frame.name] = frame
@@ -556,7 +559,7 @@ def import_transforms(
     return draft.finish(of_file if own_split else every_nth(sorted(frames), draft.hold_out))
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read_transforms(path: Path) -> dict[str, Any]:
     expected = "Expected a transforms.json of nerfstudio or instant-ngp: an object with a list `frames`."
     try:
         content = json.loads(path.read_bytes())  # also UTF-16, and with a byte-order mark
@@ -600,7 +603,7 @@ def _undone(pose: Floats, applied: Floats, scale: float) -> Floats:
     return np.asarray(np.linalg.inv(applied) @ pose)
 
 
-class _Frame:
+class _TransformsFrame:
     """One image of the file. Its own values override those at the top level."""
 
     def __init__(self, path: Path, number: int, entry: Mapping[str, Any], shared: Mapping[str, Any]) -> None:
@@ -702,6 +705,9 @@ class _Frame:
         return ("OPENCV", [k1, k2, p1, p2]) if any((k1, k2, p1, p2)) else ("PINHOLE", [])
 
 
+# Panoramas
+
+
 def import_panoramas(
     images: str | Path, capture: str | Path, device: str = "ios", split: str = "query", table: str | Path | None = None,
     poses_are: str = "world_from_cam", **options: Any,
@@ -712,12 +718,12 @@ def import_panoramas(
     y down. It is the frame of the rig, so the pose of a query is that of its panorama. The ground and the sky more than
     45 degrees from the horizon are left out. A mask of a panorama is cut as well, see `images.find_mask`. Raise
     CaptureError for a malformed table, a map without poses, two panoramas of one name, the session exists already, or
-    no panorama is left; ManifestError as for `interchange.import_images`.
+    no panorama is left; ManifestError as for `import_images`.
 
     Args:
         images: folder of JPEG and PNG files.
-        capture, device, split: as for `interchange.import_colmap`.
-        table, poses_are: as for `interchange.import_images`, with a row for each panorama.
+        capture, device, split: as for `import_colmap`.
+        table, poses_are: as for `import_images`, with a row for each panorama.
         options: see `drafts.Options`; `unit_m` is 1 by default.
     """
     folder = Path(images)

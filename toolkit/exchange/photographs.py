@@ -236,6 +236,9 @@ def _initial(path: Path, size: tuple[int, int]) -> pycolmap.Camera:
     return camera
 
 
+# Rigs
+
+
 def read_rigs(rig: str | Path, photographs: Sequence[Photograph]) -> Prefixes:
     """Return the rigs of `FOLDERS`, or of a file in COLMAP's format `rig_config.json`.
 

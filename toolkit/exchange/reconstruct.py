@@ -639,6 +639,9 @@ def _hand_over(work: _Work, session: Path) -> None:
                     items.add(name, store_source, source[made])
 
 
+# A map that grows
+
+
 @heals
 def add_recording(
     sources: Sequence[str | Path], capture: str | Path, device: str = "ios", fps: float | None = None

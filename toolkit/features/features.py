@@ -122,6 +122,9 @@ def rootsift_64(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.rint(shortened * steps[:, None].astype(np.float32)) * STEP)
 
 
+# Features and their kinds
+
+
 @dataclass(frozen=True)
 class LocalFeatures:
     """Local features of one image as it is stored, strongest response first."""
@@ -258,6 +261,9 @@ def usable(features: LocalFeatures, mask: Path | None, camera: pycolmap.Camera) 
         raise ImageError(f"No features, as the mask of the image is black everywhere: {mask}")
     x, y = np.clip(features.keypoints.astype(np.int64), 0, [width - 1, height - 1]).T
     return features.take(np.flatnonzero(pixels[y, x]))
+
+
+# SIFT
 
 
 def stretch_contrast(gray: NDArray[np.uint8], max_gain: float = 8.0) -> NDArray[np.uint8]:

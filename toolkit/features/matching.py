@@ -370,6 +370,9 @@ def _about_axis(rays: Floats, axis: Floats) -> tuple[Floats, Floats]:
     return np.arctan2(rays @ y, rays @ x), np.arccos(np.clip(rays @ axis, -1.0, 1.0))
 
 
+# Verification
+
+
 class Verifier:
     """Counts the matches of a query image and map images that agree with one relative pose.
 

@@ -238,6 +238,9 @@ class SuperPointExtractor(NetworkExtractor):
         return packed
 
 
+# LightGlue
+
+
 class LightGlueMatcher(Remade):
     """Matches pairs of images of any sizes, with any numbers of learned features, in batches, on any device.
 

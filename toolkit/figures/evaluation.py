@@ -244,6 +244,9 @@ def draw_steps(table: pd.DataFrame) -> "Figure":
     return figure
 
 
+# Evaluation
+
+
 @dataclass
 class Evaluation:
     """The tables of a scene. Every pair has a row, also if it could not be evaluated (column `state`)."""

@@ -272,6 +272,9 @@ def places_of(positions: Floats) -> Ints:
     return np.argsort(np.argsort(first))[inverse]
 
 
+# In perspective
+
+
 def pyramids(poses: Floats, depth: float) -> Floats:
     """Return cameras (N, 4, 4) as lines (N, 11, 3) of pyramids of a depth."""
     outline = (depth * PYRAMID)[OUTLINE]

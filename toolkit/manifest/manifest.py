@@ -259,6 +259,9 @@ class Manifest(Settings):
         return tuple(stage for stage in STAGES if getattr(self, stage) is not None)
 
 
+# Reading
+
+
 def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
     """Read and check a manifest and make its paths absolute.
 

@@ -291,6 +291,9 @@ def _text(change: Floats, cameras: Sequence[pycolmap.Camera], corner: float) -> 
 MIN_NOISE = PoseNoise(0.02, 0.001)  # one of the two may be zero
 
 
+# Bundle adjustment
+
+
 def refined_poses(
     local_map: LocalMap, keypoints: Sequence[NDArray[np.float32]], noise: PoseNoise, threads: int = -1
 ) -> Floats:

@@ -230,6 +230,9 @@ def refine_points(
     return RefinedPoints(points[seen], kept, float((error[good][used] ** 2).sum()), freedom)
 
 
+# Tiles
+
+
 class Tile(NamedTuple):
     """Images that are triangulated together."""
 

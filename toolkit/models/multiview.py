@@ -42,6 +42,9 @@ Fit = tuple[Size, ArrayLike, ArrayLike]
 original pixels to its pixels."""
 
 
+# Dense predictions
+
+
 class ResidualUnit(nn.Module):
     """Two 3 x 3 convolutions with a residual connection."""
 
@@ -197,6 +200,9 @@ def add_position(x: Tensor, aspect: float, factor: float = 0.1) -> Tensor:
 def resize(x: Tensor, size: Sequence[int]) -> Tensor:
     """Resize maps to (N, C, *size) by bilinear interpolation; corner pixels keep their values."""
     return F.interpolate(x, list(size), mode="bilinear", align_corners=True)
+
+
+# Views
 
 
 @dataclass(frozen=True)

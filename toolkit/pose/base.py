@@ -389,6 +389,9 @@ def agree(world_from_rig: Floats | None, other: Floats | None, share: float = 1.
     return bool(rotation_deg <= share * AGREEMENT[0] and distance_m <= share * AGREEMENT[1])
 
 
+# Queries and localizers
+
+
 @dataclass(frozen=True)
 class View:
     """One image with its camera."""

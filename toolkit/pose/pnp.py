@@ -167,6 +167,9 @@ def probability_right(evidence: Mapping[str, Floats | float], weights: Floats | 
         return np.asarray(np.nan_to_num(expit(terms(evidence) @ weights), nan=0.0), np.float64)
 
 
+# The search for the pose
+
+
 @dataclass(frozen=True)
 class _Hypothesis:
     """A pose and the matches that support it: guided matches, or those of RANSAC if guided matching finds too few."""

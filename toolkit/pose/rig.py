@@ -368,6 +368,9 @@ def _matrix(pose: Floats) -> Floats:
     return np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
 
 
+# The check of the intrinsics
+
+
 @dataclass(frozen=True)
 class Misfit:
     """Intrinsics that fit the matches of a pose significantly better than the stated ones."""

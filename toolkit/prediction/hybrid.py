@@ -301,6 +301,9 @@ def _consistent(estimate: QueryResult, predicted: QueryResult) -> bool:
     return bool(np.isfinite(spread).all() and np.radians(rotation_deg) <= limits[0] and distance_m <= limits[1])
 
 
+# Matching and prediction
+
+
 class HybridLocalizer(Localizer):
     """Adds a predicted pose to the hypotheses of a `PnpLocalizer`, and depth where its map points do not suffice."""
 

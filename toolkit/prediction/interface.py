@@ -90,6 +90,9 @@ class Predictor(Protocol):
         """Return a prediction for each group of views, the query's first; groups do not influence each other."""
 
 
+# Supported networks
+
+
 def shown_size(view: View) -> Size:
     """Return the width and height of the upright photograph."""
     size = (view.camera.width, view.camera.height)

@@ -216,6 +216,9 @@ def _nearest_depth(points: Floats, view: View, world_from_cam: Floats, grid: Int
     return np.asarray(np.median(in_cam[finite, 2][nearest], axis=1)).reshape(x.shape)
 
 
+# Networks
+
+
 def open_predictor(settings: LocalizeSettings, capture: Capture, map_dir: Path) -> Predictor:
     """Return the predictor of the settings. Warn about the simulated one, which uses the ground truth.
 

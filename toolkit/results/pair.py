@@ -283,6 +283,9 @@ def find_query(query: object, images: Mapping[str, int], count: int, what: str =
     raise ArtifactError(f"{what}: no {what} has an image {str(query)!r}. {hint}")
 
 
+# Runs, and how they localized
+
+
 def no_such_run(run: Path) -> ArtifactError:
     """Return an error that lists the runs beside a folder that is none."""
     known = [path.parent.name for path in run.parent.glob(f"*/{RECORD}")]

@@ -318,6 +318,9 @@ def _versions() -> dict[str, str]:
     return versions
 
 
+# Sweeps
+
+
 def changed_keys(plain: Manifest, changed: Manifest, overrides: Iterable[str]) -> dict[str, str]:
     """Return, by key, the values of the overrides, `key=value` each, that make a difference between two manifests."""
     before, after = (manifest.model_dump(mode="json") for manifest in (plain, changed))

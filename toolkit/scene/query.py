@@ -218,6 +218,9 @@ def _turns(turns: Any) -> list[int]:
         raise CameraError(f"turns: found {turns!r}, expected whole numbers of quarter turns, one per image.") from None
 
 
+# A query in its map
+
+
 class Retrieved(list[References]):
     """The references of each image of a query. A notebook displays them as a figure."""
 
@@ -399,6 +402,9 @@ def show_matches(scene_map: Map, matches: QueryMatches, rank: int, image: int) -
     reference = shown(name, scene_map.session.image_path(row), scene_map.session.cameras([row])[0], pixels)
     query = shown(view.name, view.image, view.camera, of_pair.pixels[seen])
     return draw_pair(query, reference, f"{len(seen)} matches by descriptors with reference {rank}")
+
+
+# The search for references
 
 
 class ReferenceSearch:

@@ -121,6 +121,9 @@ def _network_matches(matches: Sequence[MatchStore | None], name: str) -> list[Ne
     return [None if store is None else of(store) for store in matches]
 
 
+# The queries of finished pairs
+
+
 class InspectedPair:
     """The queries of one pair of a finished run, to inspect one at a time."""
 
@@ -345,6 +348,9 @@ def choose(queries: Any, chosen: int | str = 0) -> Choice:
 
     dropdown.observe(show, "value")
     return choice
+
+
+# A run
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,9 @@ FORMAT = 3  # increase it when the same settings produce other bytes
 WRONG_FOCAL = 1.12
 
 
+# Devices
+
+
 @dataclass(frozen=True)
 class Sensor:
     """One camera of a device, with its position (meters) and angles in the body frame (x forward, y left, z up)."""
@@ -331,6 +334,9 @@ def scans(
             yield time, sensor_id, emitter.id, emitter.frequency_khz, level, "campus", time - SCAN_US, time
         else:
             yield time, sensor_id, emitter.id, level, "beacon"
+
+
+# The capture
 
 
 class World(DemoData):

@@ -63,6 +63,9 @@ def named_rng(*key: int | str) -> Rng:
     return np.random.default_rng([k if isinstance(k, int) else zlib.crc32(k.encode()) for k in key])
 
 
+# Rooms
+
+
 @dataclass
 class Quad:
     """A textured rectangle, given by the top-left corner of its texture and the texture's unit axes in the world frame.
@@ -260,7 +263,7 @@ def _cells(height: float, width: float, colors: Any, stagger: str, **options: An
 
 def build_room(seed: int, index: int, look: int | None = None) -> Scene:
     """Return the geometry and materials of a room, at the position of its index, with its own look or that of another
-    index; `render.paint` makes its textures.
+    index; `paint` makes its textures.
     """
     look = index if look is None else look
     rng = named_rng(seed, look, "room")
@@ -330,6 +333,9 @@ def _furnish_middle(scene: Scene, rng: Rng) -> None:
         x, y, z = 0.24 * w * np.cos(angle), 0.24 * d * np.sin(angle), min(h, 3.4) - rng.uniform(0.7, 0.9)
         scene.box((x, y, angle), z, (0.45, 0.45, 0.3), [tex.cloth, tex.poster, tex.painting][i], ppm=300)
         scene.box((x, y, angle), z + 0.3, (0.02, 0.02, h - z - 0.3), tex.lamp, lit=False)
+
+
+# Painting and rendering
 
 
 def _blocked(scene: Scene, start: Image, way: Image) -> NDArray[np.bool_]:

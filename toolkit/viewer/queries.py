@@ -203,6 +203,9 @@ def rgb(color: str) -> list[int]:
     return [int(color[k : k + 2], 16) for k in (1, 3, 5)]
 
 
+# In a notebook
+
+
 def show_picture(path: str | Path) -> Any:
     """Return a picture file for a notebook, which enlarges it on a click: as it is, or as a JPEG if that is smaller."""
     import PIL.Image
@@ -333,6 +336,9 @@ class View3D:
         with tempfile.TemporaryDirectory() as folder:
             viewer = open_viewer(lambda: self.save(Path(folder) / "view.rrd"))
         return picture | (viewer._repr_mimebundle_()[0] if viewer is not None else {})
+
+
+# The queries of a pair
 
 
 def record_localizations(
