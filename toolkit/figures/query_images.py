@@ -77,7 +77,8 @@ def draw_image(
         image = image.image
     pixels = read_for_display(image, inches_to_pixels(inches)) if isinstance(image, Path) else image
     axis.imshow(pixels, cmap="gray", extent=extent, interpolation="antialiased")
-    axis.set(xticks=[], yticks=[])
+    for side in (axis.xaxis, axis.yaxis):
+        side.set_visible(False)  # a layout also measures axes without ticks
     axis.set_title(title, fontsize=8, color=color)
     axis.spines[:].set(visible=frame is not None, color=frame, linewidth=2)
     return extent[1] if extent else pixels.shape[1]
