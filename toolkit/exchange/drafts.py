@@ -58,7 +58,7 @@ from toolkit.exchange.recordings import (
 )
 from toolkit.files import IMPORTED, MASKS, own_name, read_json, recover_folder, write_atomic, write_folder, write_text
 from toolkit.geometry import Floats, make_pose, scaled
-from toolkit.manifest import nearest
+from toolkit.manifest import require_known
 
 SUBSESSION = "import"
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -652,10 +652,8 @@ def start(capture: str | Path, device: str, split: str, folder: Path, **options:
     draft = Draft(_session(Path(capture), device, split, may_exist), folder, **options)
     if draft.add and (draft.replace or draft.gps):
         raise ManifestError(f"add: found together with {'replace' if draft.replace else 'gps'}. Give one of them.")
-    if draft.placing not in PLACING:
-        raise ManifestError(f"images: unknown choice {draft.placing!r}. {nearest(draft.placing, PLACING)}")
-    if draft.axes not in AXES:
-        raise ManifestError(f"axes: unknown {draft.axes!r}. {nearest(draft.axes, AXES)}")
+    require_known("images", draft.placing, PLACING)
+    require_known("axes", draft.axes, AXES)
     if draft.unit_m is not None and not 0 < draft.unit_m < np.inf:
         raise ManifestError(f"unit: found {draft.unit_m:g}, expected the meters per unit of the poses, such as 0.01.")
     if not 0 < draft.depth_unit_mm < np.inf:
@@ -671,8 +669,7 @@ def start(capture: str | Path, device: str, split: str, folder: Path, **options:
 
 def _session(capture: Path, device: str, split: str, may_exist: bool) -> Path:
     """Return the folder of a session. Raise CaptureError if it must not exist, ManifestError if its name is invalid."""
-    if split not in SPLITS:
-        raise ManifestError(f"split: unknown {split!r}. {nearest(split, SPLITS)}")
+    require_known("split", split, SPLITS)
     if not re.fullmatch(r"[a-z0-9-]+", device):  # the rule for `extra_devices` in a manifest
         raise ManifestError(f"device: found {device!r}, expected lower-case letters, digits and '-', such as drone.")
     session = capture / "sessions" / f"{device}_{split}"

@@ -60,7 +60,7 @@ from toolkit.files import (
     write_text,
 )
 from toolkit.geometry import Floats, invert, pose_from_qt, qt_from_pose
-from toolkit.manifest import nearest
+from toolkit.manifest import require_known
 from toolkit.mapping.local_map import LocalMap, map_path
 from toolkit.pose.base import Status, statuses
 from toolkit.results.pair import PairResults, localized_scenes, map_inputs, names_of_maps, pairs_of
@@ -95,7 +95,7 @@ def export_colmap(
             other images or features than those that are there.
         ManifestError: the folder `out` contains files.
     """
-    _require_names(names)
+    require_known("names", names, NAMES)
     files, session_id, out = SceneFiles(Path(run), scene), f"{device}_map", Path(out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ManifestError(f"{out}: contains files already. Give an empty or new folder.")
@@ -239,7 +239,7 @@ def export_pairs(
     is of older vectors, a line of it is malformed, a name contains a space, or a query and a reference have the same
     name.
     """
-    _require_names(names)
+    require_known("names", names, NAMES)
     path = SceneFiles(Path(run), scene).retrieval(map_device, query_device)
     require_current(path, "retrieve", missing=False)
     pairs = []
@@ -267,7 +267,7 @@ def export_poses(
     number of lines. Raise ArtifactError if the run has no such poses, they are of older references or of an older map,
     or a name contains a space.
     """
-    _require_names(names)
+    require_known("names", names, NAMES)
     path = _require_poses(SceneFiles(Path(run), scene).poses_txt(map_device, query_device))
     session, poses = session_of_run(run, scene, f"{query_device}_query", capture), Trajectory.read(path)
     lines = []
@@ -287,7 +287,7 @@ def export_intrinsics(
 
     Queries without a pose are included. Returns and errors are those of `export_poses`.
     """
-    _require_names(names)
+    require_known("names", names, NAMES)
     path = _require_poses(SceneFiles(Path(run), scene).poses_csv(map_device, query_device))
     session = session_of_run(run, scene, f"{query_device}_query", capture)
     rows = [row for rows in session.rows_of_keyframes(PairResults.open(path).table) for row in rows]
@@ -300,11 +300,6 @@ def _write_list(out: str | Path, rows: Iterable[tuple[str, ...]]) -> int:
     lines = [f"{' '.join(row)}\n" for row in rows]
     write_text(out, "".join(lines))
     return len(lines)
-
-
-def _require_names(names: str) -> None:
-    if names not in NAMES:
-        raise ManifestError(f"names: unknown {names!r}. {nearest(names, NAMES)}")
 
 
 def _exported(name: str, names: str) -> str:

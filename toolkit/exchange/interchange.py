@@ -84,7 +84,7 @@ from toolkit.exchange.recordings import (
 )
 from toolkit.files import file_fingerprint, files_fingerprint, read_json
 from toolkit.geometry import Floats, invert, make_pose, pose_from_qt, qt_from_pose
-from toolkit.manifest import nearest
+from toolkit.manifest import nearest, require_known
 
 POSE_DIRECTIONS = ("world_from_cam", "cam_from_world", "rotation_of_cam_from_world")
 _CAMERA_COLUMNS = ("model", "width", "height", "params")
@@ -185,8 +185,7 @@ def import_images(
             poses, truth that names no image, the session exists already, or no image is left.
         ManifestError: an unknown direction, truth for a map or together with poses in the table; as for `drafts.start`.
     """
-    if poses_are not in POSE_DIRECTIONS:
-        raise ManifestError(f"poses_are: unknown {poses_are!r}. {nearest(poses_are, POSE_DIRECTIONS)}")
+    require_known("poses_are", poses_are, POSE_DIRECTIONS)
     options.setdefault("unit_m", 1.0)
     draft, folder = start(capture, device, split, Path(images), **options), Path(images)
     if not folder.is_dir():
@@ -412,8 +411,7 @@ def _poses_of(rows: pd.DataFrame, poses_are: str) -> dict[str, Floats]:
 
 def read_poses(table: Path, poses_are: str) -> tuple[list[str], dict[str, Floats]]:
     """Return the images of a table, and their world_from_cam (4, 4) in the table's unit; see `import_images`."""
-    if poses_are not in POSE_DIRECTIONS:
-        raise ManifestError(f"poses_are: unknown {poses_are!r}. {nearest(poses_are, POSE_DIRECTIONS)}")
+    require_known("poses_are", poses_are, POSE_DIRECTIONS)
     rows = _read_table(table)
     return list(rows["image"]), _poses_of(rows, poses_are)
 

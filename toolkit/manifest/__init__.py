@@ -35,4 +35,5 @@ from toolkit.manifest.settings import (
     checkpoint_of,
     describe,
     nearest,
+    require_known,
 )

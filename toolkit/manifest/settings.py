@@ -20,6 +20,12 @@ _BRANCH = r"literal|int$|str$|list\[|dict\[|constrained"
 """Names that pydantic adds to the path of a key whose value may have several types."""
 
 
+def require_known(what: str, value: str, known: Iterable[str]) -> None:
+    """Raise ManifestError, which names the nearest of the known values, for an unknown value of an option."""
+    if value not in (known := [*known]):
+        raise ManifestError(f"{what}: unknown {value!r}. {nearest(value, known)}")
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return a sentence that suggests the known name nearest to `name`, and lists all known names."""
     known = sorted(known)
