@@ -272,7 +272,7 @@ class Map:
         if near is not None:
             allowed = [self._may_show(pose, near) for pose in near.world_from_rig @ query.rig_from_cams]
         for rows, scores in self.search.find(query, k, allowed):
-            indices = np.array([self.index_of.get(self.session.image_name(int(row)), -1) for row in rows], np.int64)
+            indices = np.array([self.index_of.get(self.session.image_names[row], -1) for row in rows], np.int64)
             references.append(References(indices[indices >= 0], scores[indices >= 0]))
         return references
 
@@ -602,7 +602,7 @@ class Map:
 
     def load(self) -> None:
         """Load what all queries share, before several threads find it missing: `cached_property` has no lock."""
-        _ = self.localizer, self.index_of, self.fallback
+        _ = self.localizer, self.index_of, self.fallback, self.session.image_names
         self.search.load()
         for kind in self.escalation:
             _ = kind.extractor
