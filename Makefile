@@ -15,7 +15,7 @@ OF_KIND := $(PYTEST) -m "not browser and not gpu"
 NUMBERS := $(addprefix tests/,alignment embedders features mapping models pose prediction scene sequences synthetic \
 	$(addsuffix .py,$(addprefix test_,accuracy benchmark_reader confidence embed evaluate geometry localize \
 	references_file rerank retrieve sequence threads)))
-FAULTS := $(addprefix tests/,capture exchange fuzz store $(addsuffix .py,$(addprefix test_,damage empty_sets files kills \
+FAULTS := $(addprefix tests/,capture datasets exchange fuzz store $(addsuffix .py,$(addprefix test_,damage empty_sets files kills \
 	lineage manifest pretend_device properties stops)))
 NOTEBOOKS := $(addprefix tests/,figures report results runs viewer $(addsuffix .py,$(addprefix test_,compare_notebook \
 	docs lab notebooks own_images package pages pipeline rooms visualize)))
@@ -43,7 +43,7 @@ test-kernels: $(INSTALLED)  ## run the tests of numbers with other BLAS kernels 
 	OPENBLAS_CORETYPE=$${run% *} OPENBLAS_NUM_THREADS=$${run#* } $(PYTEST) tests/test_localize.py tests/test_geometry.py \
 	$(addprefix tests/,features embedders alignment mapping pose prediction scene sequences) \
 	$(addsuffix .py,$(addprefix --ignore=tests/,features/test_aliked features/test_lightglue \
-	features/test_superpoint prediction/test_network_predictor scene/test_inspection scene/test_located)); done
+	features/test_superpoint prediction/test_network scene/test_inspection scene/test_query)); done
 
 # All tests of a kind, default and slow. Together the three have every test that needs neither a browser nor a GPU.
 test-numbers: $(INSTALLED)  ## test what is computed: features, maps, poses, networks, errors, accuracy on captures

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from toolkit.synthetic.devices import Device
+    from toolkit.synthetic.capture import Device
 
 
 def limit_cores(threads: int) -> None:

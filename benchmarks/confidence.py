@@ -1,4 +1,4 @@
-"""How probable is it that a pose is right? Fits the weights of `toolkit/pose/confidence.py`.
+"""How probable is it that a pose is right? Fits the weights of `toolkit/pose/pnp.py`.
 
     python benchmarks/confidence.py FOLDER CAPTURE... [--rendered 0 1] [--alike 0 1] [--rows ROWS.csv] [--out FILE.md]
         [--held-out SCENE]...
@@ -31,7 +31,7 @@ from common import add_out, check_out, limit_cores, markdown_table, write_out
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from toolkit.synthetic.scene import Quad, Scene
+    from toolkit.synthetic.render import Quad, Scene
     from toolkit.synthetic.textures import Material
 
 WRONG = (5.0, 0.5)  # degrees, meters
@@ -128,7 +128,7 @@ def harden(capture: Path, copy: Path, way: Way, seed: int) -> None:
 
 def _longer(line: str, factor: float) -> str:
     """Return a line of sensors.txt, a camera's focal lengths times a factor."""
-    from toolkit.capture.cameras import camera_text, parse_camera
+    from toolkit.capture.images import camera_text, parse_camera
 
     if line.startswith("#") or line.split(",")[2].strip() != "camera":
         return line
@@ -178,7 +178,7 @@ def fit(rows: pd.DataFrame, ridge: float = 1.0) -> NDArray[np.float64]:
     """Return the weights of `terms` that tell right poses from wrong ones best."""
     from scipy.optimize import minimize
 
-    from toolkit.pose.confidence import EVIDENCE, WEIGHTS, terms
+    from toolkit.pose.pnp import EVIDENCE, WEIGHTS, terms
 
     rows = rows[rows["posed"] & ~rows["refused"]]
     x = terms({name: rows[name].to_numpy(np.float64) for name in EVIDENCE})
@@ -203,7 +203,7 @@ def fit(rows: pd.DataFrame, ridge: float = 1.0) -> NDArray[np.float64]:
 
 def stated(rows: pd.DataFrame, weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the probability of each row, bounded as in the localizer; 0 where there is no pose or no deviation."""
-    from toolkit.pose.confidence import EVIDENCE, bounded_by_deviation, bounded_by_rivals, probability_right
+    from toolkit.pose.pnp import EVIDENCE, bounded_by_deviation, bounded_by_rivals, probability_right
 
     evidence = {name: rows[name].to_numpy(np.float64) for name in EVIDENCE}
     alone = np.where(rows["posed"], probability_right(evidence, weights), 0.0)
@@ -227,7 +227,7 @@ def judge(rows: pd.DataFrame, probability: NDArray[np.float64]) -> dict[str, flo
 
 def markdown(rows: pd.DataFrame, held_out: list[str]) -> str:
     """Return the weights, and how they hold on scenes that they were not fitted on."""
-    from toolkit.pose.confidence import WEIGHTS
+    from toolkit.pose.pnp import WEIGHTS
 
     learned, other = rows[~rows["scene"].isin(held_out)], rows[rows["scene"].isin(held_out)]
     weights = fit(learned)
@@ -260,7 +260,7 @@ def markdown(rows: pd.DataFrame, held_out: list[str]) -> str:
 
 def room_of_few_models(seed: int, index: int, look: int | None = None) -> "Scene":
     """Return a room with doors, windows, shelves, cabinets and crates in few models, as in all rooms of the seed."""
-    from toolkit.synthetic.scene import build_room, named_rng
+    from toolkit.synthetic.render import build_room, named_rng
     from toolkit.synthetic.textures import Image, Rng
 
     def draw(quad: "Quad", material: "Material", name: str, rng: Rng, h: int, w: int, ppm: float) -> Image:

@@ -64,8 +64,7 @@ def write_rows(folder: Path, embeddings: Path | None, images: int, queries: int,
 def ask(folder: Path, images: int, factory: str, candidates: int) -> dict[str, float]:
     """Build an index and ask it; for `Flat` the exact search writes what the others are compared with."""
     from toolkit.embedders import StoredVectors, Vectors
-    from toolkit.embedders.index import make_index
-    from toolkit.embedders.search import search
+    from toolkit.embedders.search import make_index, search
     from toolkit.manifest import RetrieveSettings
 
     query = np.load(folder / "queries.npy")

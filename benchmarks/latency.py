@@ -142,7 +142,7 @@ def main() -> None:
         capture = options.capture
         if capture is None:
             from toolkit.synthetic import render_capture
-            from toolkit.synthetic.devices import DEVICES
+            from toolkit.synthetic.capture import DEVICES
 
             DEVICES["ios"] = scaled(DEVICES["ios"], options.scale)
             capture = render_capture(Path(folder) / "RENDERED", rooms=2, frames=12, seed=0, progress=False)

@@ -152,7 +152,7 @@ def row(name: str, pairs: int, seconds: Seconds, beside: Seconds, same: float | 
 
 def benchmark_lightglue(args: argparse.Namespace, device: str) -> list[list[str]]:
     """Return rows of the table."""
-    from toolkit.features.lightglue import LightGlueMatcher
+    from toolkit.features.network import LightGlueMatcher
 
     def create(dtype: str, size: int) -> LightGlueMatcher:
         return LightGlueMatcher(weights, device, dtype, batch_size=size, features=args.features)

@@ -48,7 +48,7 @@ Sets = dict[str, Photographs]
 def sets_of_capture(path: Path, folder: Path) -> Sets:
     """Link the images of each recording of a map."""
     from toolkit.capture import Capture
-    from toolkit.capture.cameras import camera_text
+    from toolkit.capture.images import camera_text
 
     sets: Sets = {}
     for session in Capture.open(path).usable("map"):

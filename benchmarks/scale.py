@@ -107,7 +107,7 @@ def render(folder: Path, images: int) -> Path:
     """Render whole rooms of about so many map images, if they are not there, and list the queries."""
     from toolkit.capture import Session
     from toolkit.synthetic import capture as rendering
-    from toolkit.synthetic.devices import DEVICES
+    from toolkit.synthetic.capture import DEVICES
 
     rendering.DEVICES = {"ios": scaled(DEVICES["ios"], 0.5)}  # this process renders nothing else
     rooms = max(1, round(images / FRAMES))
@@ -260,7 +260,7 @@ class Books:
 
         from toolkit.capture import Trajectory, write_session
         from toolkit.geometry import make_pose, qt_from_pose
-        from toolkit.synthetic.devices import DEVICES, looking
+        from toolkit.synthetic.capture import DEVICES, looking
 
         (sensor,) = DEVICES["ios"].sensors
         for split, step in (("map", 1), ("query", 17)):
@@ -301,7 +301,7 @@ class Books:
 
     def plan_tiles(self) -> None:
         from toolkit.manifest import MapSettings
-        from toolkit.mapping.tiles import plan_tiles
+        from toolkit.mapping.triangulation import plan_tiles
 
         self.tiles = plan_tiles(self.poses[:, :3, 3] + 4 * self.poses[:, :3, 2], self.pairs, MapSettings().tile_images)
 
@@ -343,7 +343,7 @@ class Books:
     def join_tiles(self) -> None:
         from toolkit.geometry import invert, transform
         from toolkit.mapping.local_map import LocalMap
-        from toolkit.mapping.tiles import JoinedImages, join_tiles
+        from toolkit.mapping.triangulation import JoinedImages, join_tiles
 
         def keypoints(image: int) -> np.ndarray:
             seen = self.points[self.obs_point[slice(*self.starts[image : image + 2])]]
@@ -376,7 +376,7 @@ class Books:
 
     def write_descriptors(self) -> None:
         """Write as many random numbers as VLAD has dimensions, as float16."""
-        from toolkit.embedders.stored import MANIFEST_COLUMNS
+        from toolkit.embedders.search import MANIFEST_COLUMNS
 
         rng = np.random.default_rng(0)
         for session in (self.capture[name] for name in self.capture):

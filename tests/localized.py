@@ -9,7 +9,7 @@ import pandas as pd
 
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.files import pair_name
-from toolkit.pose.result import Correspondences, QueryResult, Rival, Status
+from toolkit.pose.base import Correspondences, QueryResult, Rival, Status
 from toolkit.results.pair import MAPS, PairResults, query_group
 from toolkit.store.hdf5 import write_groups
 

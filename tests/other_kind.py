@@ -4,8 +4,7 @@ from typing import Any
 
 import pytest
 
-from toolkit.features.features import KINDS, FeatureKind
-from toolkit.features.sift import SiftExtractor
+from toolkit.features.features import KINDS, FeatureKind, SiftExtractor
 
 OTHER = FeatureKind(
     "tests.other_kind:OtherExtractor", ("mutual",), 0.85, -1.0,

@@ -12,8 +12,7 @@ from toolkit.capture import Session
 from toolkit.features.features import LocalFeatures
 from toolkit.features.stores import FeatureStore
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.base import NetworkMatches, Query, References, View
-from toolkit.pose.result import QueryResult
+from toolkit.pose.base import NetworkMatches, Query, QueryResult, References, View
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -18,7 +18,7 @@ from toolkit.manifest import PredictorSettings
 from toolkit.mapping.local_map import LocalMap
 from toolkit.pose.base import QueryInput
 from toolkit.prediction.feed_forward import FeedForwardLocalizer
-from toolkit.prediction.simulated import SimulatedPredictor
+from toolkit.prediction.network import SimulatedPredictor
 
 Floats = NDArray[np.float64]
 LIST = "keyframes_original"

@@ -10,7 +10,7 @@ import pytest
 
 from toolkit.capture import Capture
 from toolkit.geometry import pose_error
-from toolkit.pose.confidence import WEIGHTS, bounded_by_deviation, bounded_by_rivals, probability_right
+from toolkit.pose.pnp import WEIGHTS, bounded_by_deviation, bounded_by_rivals, probability_right
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "confidence.py"
 

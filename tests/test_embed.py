@@ -17,8 +17,7 @@ from tests.calls import call
 from tests.models.test_megaloc import tiny_megaloc
 from toolkit import embed
 from toolkit.capture import Session, Trajectory, write_session
-from toolkit.capture.images import read_image
-from toolkit.capture.upright import turned_from_cam
+from toolkit.capture.images import read_image, turned_from_cam
 from toolkit.embed import embed_sessions, write_matrix
 from toolkit.embedders import load_embeddings
 from toolkit.embedders.megaloc import MegaLocEmbedder

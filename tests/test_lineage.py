@@ -13,12 +13,10 @@ import pytest
 
 from toolkit import notebook, pipeline
 from toolkit.capture import Capture
-from toolkit.capture.folder import IMPORT_RECORD
+from toolkit.capture.session import IMPORT_RECORD
 from toolkit.errors import COMMAND, ArtifactError, ManifestError
 from toolkit.evaluate import evaluate_scene
-from toolkit.exchange.export import export_colmap, export_pairs, export_poses
-from toolkit.exchange.geo import geo_table
-from toolkit.exchange.hloc import export_matches
+from toolkit.exchange.export import export_colmap, export_matches, export_pairs, export_poses, geo_table
 from toolkit.exchange.submission import collect
 from toolkit.figures.retrieval import RetrievedPair
 from toolkit.files import (
@@ -39,9 +37,8 @@ from toolkit.notebook import notebook_path
 from toolkit.report.comparison import compare_runs
 from toolkit.report.page import write_report
 from toolkit.results.pair import PairResults
-from toolkit.scene.inspection import InspectedPair
 from toolkit.scene.map import Map
-from toolkit.scene.run import Run
+from toolkit.scene.run import InspectedPair, Run
 from toolkit.store.items import Items
 from toolkit.visualize import visualize_scene
 

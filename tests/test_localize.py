@@ -28,36 +28,33 @@ from tests.rendered import copy_shared
 from toolkit import geometry, localize, sequence
 from toolkit.__main__ import app
 from toolkit.capture import Capture, Session, Trajectory
-from toolkit.capture.cameras import camera_text
-from toolkit.capture.folder import IMPORT_RECORD
-from toolkit.capture.images import read_image
+from toolkit.capture.images import camera_text, read_image
+from toolkit.capture.session import IMPORT_RECORD
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.embed import embed_sessions
 from toolkit.embedders import EMBEDDERS
 from toolkit.errors import ArtifactError, CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.evaluate import evaluate_scene
-from toolkit.features.features import KINDS, LocalFeatures
+from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor, SiftSettings
 from toolkit.features.matching import MATCHERS, LocalMethod, MutualMatcher, unit_descriptors
-from toolkit.features.sift import SiftExtractor, SiftSettings
 from toolkit.features.stores import extract_session
 from toolkit.files import SceneFiles, image_name, map_record_path, read_map_record, read_references, sidecar_path
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
 from toolkit.manifest import EmbedSettings, LocalizeSettings
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.base import Localizer, Prior, Query, QueryMatches, References, RoughPose, View
+from toolkit.pose.base import Localizer, Prior, Query, QueryMatches, QueryResult, References, RoughPose, Status, View
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer
-from toolkit.pose.result import QueryResult, Status
 from toolkit.prediction import network as predictors
 from toolkit.prediction.interface import Prediction
-from toolkit.prediction.simulated import SimulatedPredictor
+from toolkit.prediction.network import SimulatedPredictor
 from toolkit.rerank import rerank_pairs
 from toolkit.results.pair import PairResults
 from toolkit.retrieve import load_embeddings, retrieve_pairs
 from toolkit.scene import map as maps
-from toolkit.scene import search
-from toolkit.scene.inspection import InspectedPair
+from toolkit.scene import query as search
 from toolkit.scene.query import pixels_from
+from toolkit.scene.run import InspectedPair
 from toolkit.sequence import sequence_pairs
 
 LIST = "keyframes_original"

@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 from typer.testing import CliRunner
 
-from tests.exchange.test_datasets import seven_scenes
+from tests.datasets.test_layouts import seven_scenes
 from tests.test_docs import ROOT, commands_of
 from toolkit.__main__ import app
 from toolkit.capture import Session

@@ -16,13 +16,12 @@ from tests.models import test_da3 as da3
 from tests.models import test_omega as omega
 from tests.models.test_megaloc import tiny_megaloc
 from tests.models.test_vggt import tiny
-from tests.prediction.test_network_predictor import HIGHER, WIDE, Photographs, assert_same
+from tests.prediction.test_network import HIGHER, WIDE, Photographs, assert_same
 from tests.pretend import DEVICE, PretendTensor, pretending, resolved
 from toolkit.capture.masks import Masks
 from toolkit.embedders import megaloc, search
-from toolkit.features import lightglue, network
-from toolkit.features.lightglue import LightGlueMatcher
-from toolkit.features.network import NetworkExtractor, SuperPointExtractor
+from toolkit.features import network
+from toolkit.features.network import LightGlueMatcher, NetworkExtractor, SuperPointExtractor
 from toolkit.manifest import AlikedSettings, SuperPointSettings
 from toolkit.models.vggt import VGGT
 from toolkit.prediction import network as predictors
@@ -34,7 +33,7 @@ __all__ = ["state"]  # a fixture
 @pytest.fixture
 def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Lets `pretend` stand for a device; any other name is resolved as ever."""
-    for module in (megaloc, search, lightglue, network, predictors):
+    for module in (megaloc, search, network, predictors):
         resolve = module.resolve_device
         monkeypatch.setattr(
             module, "resolve_device", lambda name, resolve=resolve: resolved() if name == "pretend" else resolve(name)

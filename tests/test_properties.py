@@ -37,7 +37,7 @@ from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitEr
 from toolkit.exchange.submission import Submission
 from toolkit.files import read_references
 from toolkit.manifest import STAGES, Manifest, load_manifest
-from toolkit.pose.result import Correspondences
+from toolkit.pose.base import Correspondences
 from toolkit.results.pair import query_group
 from toolkit.store.hdf5 import write_groups
 from toolkit.store.items import Items

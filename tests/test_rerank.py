@@ -18,11 +18,9 @@ from toolkit import rerank
 from toolkit.capture import Capture, Trajectory
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.evaluate import overlap_table
-from toolkit.features import verification
-from toolkit.features.features import KINDS, LocalFeatures
-from toolkit.features.matching import LocalMethod, MutualMatcher
-from toolkit.features.sift import SiftExtractor
-from toolkit.features.verification import is_meaningful, verified_matches
+from toolkit.features import matching as verification
+from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor
+from toolkit.features.matching import LocalMethod, MutualMatcher, is_meaningful, verified_matches
 from toolkit.files import SceneFiles, read_references, sidecar_path
 from toolkit.geometry import invert, make_pose, transform
 from toolkit.manifest import RerankSettings

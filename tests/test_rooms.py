@@ -32,6 +32,7 @@ LEVELS: list[tuple[str, ...]] = [
     ("viewer", "report"),
     ("scene",),
     ("exchange", "synthetic"),
+    ("datasets",),
     STAGES,
     ("notebook",),
     ("pipeline",),

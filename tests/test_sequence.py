@@ -20,14 +20,14 @@ from toolkit.embed import embed_sessions
 from toolkit.errors import ManifestError
 from toolkit.files import SceneFiles, map_record_path, pair_name
 from toolkit.localize import localize_pairs
-from toolkit.pose.result import QueryResult
+from toolkit.pose.base import QueryResult
 from toolkit.retrieve import retrieve_pairs
 from toolkit.sequence import COLUMNS, sequence_pairs
 from toolkit.sequences.pose_graph import FAR
 from toolkit.synthetic import capture as rendering
 from toolkit.synthetic import render_capture
-from toolkit.synthetic.devices import DEVICES, PICTURE_S, RATE_HZ, tracked
-from toolkit.synthetic.scene import Scene, build_room
+from toolkit.synthetic.capture import DEVICES, PICTURE_S, RATE_HZ, tracked
+from toolkit.synthetic.render import Scene, build_room
 
 pytest.importorskip("gtsam")
 

@@ -81,7 +81,7 @@ from threadpoolctl import threadpool_limits
 from toolkit.embedders import vlad
 from toolkit.features.features import KINDS
 from toolkit.features.matching import MutualMatcher
-from toolkit.features.sift import SiftExtractor
+from toolkit.features.features import SiftExtractor
 
 vlad.MAX_WORDS = 32
 rng = np.random.default_rng(0)

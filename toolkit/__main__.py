@@ -306,7 +306,7 @@ def new(
     out: Annotated[Path, Option(help="Folder of the manifest.")] = Path("data_manifests"),
 ) -> None:
     """Write a manifest for a capture, with explanations and the findings of `check`."""
-    from toolkit.exchange.new_manifest import new_manifest
+    from toolkit.exchange.import_report import new_manifest
 
     path = new_manifest(name, capture, out)
     print(f"Manifest: {path}\nRun it: {COMMAND} run {path}")
@@ -343,7 +343,7 @@ def download(
     overrides: Settings = None,
 ) -> None:
     """Download, unpack and check the captures of a manifest; resume a stopped download."""
-    from toolkit.exchange.download import download
+    from toolkit.datasets.download import download
     from toolkit.manifest import find_manifest
 
     names = [name.strip() for name in sessions.split(",") if name.strip()]
@@ -374,10 +374,10 @@ def demo_data(
     print(f"Capture: {capture}")
 
 
-def importer(name: str, module: str | None = None) -> Callable[[Callable[..., Any]], None]:
+def importer(name: str, runs_itself: bool = False) -> Callable[[Callable[..., Any]], None]:
     """Register an import, which returns its report, as a command that also takes the options of all imports.
 
-    With a module of `toolkit.exchange`, it is the function there that has the name of the command.
+    It runs itself, or is the function of its name in `exchange.interchange`.
     """
 
     def register(command: Callable[..., Any]) -> None:
@@ -387,7 +387,7 @@ def importer(name: str, module: str | None = None) -> Callable[[Callable[..., An
 
         @wraps(command)
         def run_it(as_json: bool, **given: Any) -> None:
-            report = (_in_exchange(module, command) if module else command)(**given)
+            report = (command if runs_itself else _in_exchange("interchange", command))(**given)
             if report is not None:
                 print(report.as_json() if as_json else report.text())
 
@@ -423,7 +423,7 @@ def _shared(
     """Hold the options of all imports, see `exchange.drafts.Options`."""
 
 
-@importer("colmap", "interchange")
+@importer("colmap")
 def import_colmap(
     model: Annotated[Path, Argument(help="Folder with cameras, images, points3D as .bin or .txt.")],
     images: Annotated[Path, Argument(help="Folder that the model's image names are relative to.")],
@@ -432,7 +432,7 @@ def import_colmap(
     """Make a session from a COLMAP model: cameras, poses, rigs."""
 
 
-@importer("images", "interchange")
+@importer("images")
 def import_images(
     images: Annotated[Path, Argument(help="Folder of JPEG and PNG files.")],
     capture: ImportedTo, split: Split = "query",
@@ -452,7 +452,7 @@ def import_images(
     """Make a session from a folder of images: a map with poses, or queries."""
 
 
-@importer("panoramas", "panoramas")
+@importer("panoramas")
 def import_panoramas(
     images: Annotated[Path, Argument(help="Folder of equirectangular JPEG and PNG files, of the whole sphere.")],
     capture: ImportedTo, split: Split = "query",
@@ -465,7 +465,7 @@ def import_panoramas(
     """Make a session of 360-degree panoramas: each becomes a rig of perspective views."""
 
 
-@importer("transforms", "transforms")
+@importer("transforms")
 def import_transforms(
     path: Annotated[
         Path, Argument(metavar="transforms", help="transforms.json of nerfstudio or instant-ngp, near its images.")
@@ -476,7 +476,7 @@ def import_transforms(
     """Make a session from a transforms.json: cameras with distortion, poses."""
 
 
-@importer("dataset")
+@importer("dataset", runs_itself=True)
 def import_dataset(
     context: typer.Context,
     kind: Annotated[str, Argument(metavar="KIND", help=_KINDS)],
@@ -488,8 +488,8 @@ def import_dataset(
     **options: Any,
 ) -> Any:
     """Make a map and queries from a data set of the field, and a manifest with its thresholds."""
-    from toolkit.exchange.datasets import LAYOUTS, import_dataset
-    from toolkit.exchange.new_manifest import new_manifest
+    from toolkit.datasets.layouts import LAYOUTS, import_dataset
+    from toolkit.exchange.import_report import new_manifest
     from toolkit.manifest import nearest
     from toolkit.synthetic.photographs import KINDS, SCENES, THRESHOLDS, arrange
 
@@ -549,9 +549,8 @@ def reconstruct(
     """
     from toolkit import pipeline
     from toolkit.capture import Capture
-    from toolkit.exchange.grow import add_recording, remove_recording
-    from toolkit.exchange.new_manifest import new_manifest
-    from toolkit.exchange.reconstruct import FOLDER, reconstruct
+    from toolkit.exchange.import_report import new_manifest
+    from toolkit.exchange.reconstruct import FOLDER, add_recording, reconstruct, remove_recording
     from toolkit.figures.explore import draw_top_view
 
     if (len(sources) != 1) if remove else (len(sources) < 2):
@@ -607,13 +606,13 @@ def export_colmap(
     print(f"{out}: {export.export_colmap(run, scene, device, out, capture, names).summary()}")
 
 
-def exporter(name: str, unit: str, module: str = "export") -> Callable[[Callable[..., None]], None]:
-    """Register the function of `toolkit.exchange.<module>` with the name of a command, which returns a number."""
+def exporter(name: str, unit: str) -> Callable[[Callable[..., None]], None]:
+    """Register the function of `exchange.export` with the name of a command, which returns a number."""
 
     def register(command: Callable[..., None]) -> None:
         @wraps(command)
         def run_it(out: Path, **given: Any) -> None:
-            print(f"{out}: {_in_exchange(module, command)(out=out, **given)} {unit}")
+            print(f"{out}: {_in_exchange('export', command)(out=out, **given)} {unit}")
 
         export_app.command(name)(run_it)
 
@@ -644,7 +643,7 @@ def export_intrinsics(
     """Write the cameras of a pair's queries in hloc's format: `name MODEL width height parameters` per line."""
 
 
-@exporter("features", "images", "hloc")
+@exporter("features", "images")
 def export_features(
     run: Run, scene: Scene, session: Annotated[str, Argument(help="Session, e.g. ios_map.")], out: Hdf5File,
     kind: Kind = "sift",
@@ -652,7 +651,7 @@ def export_features(
     """Write the local features of a session in hloc's format."""
 
 
-@exporter("matches", "pairs", "hloc")
+@exporter("matches", "pairs")
 def export_matches(
     run: Run, scene: Scene,
     session0: Annotated[str, Argument(help="Session of the first images, e.g. ios_map.")],
@@ -662,14 +661,14 @@ def export_matches(
     """Write the matches of two sessions in hloc's format."""
 
 
-@exporter("geo", "images", "geo")
+@exporter("geo", "images")
 def export_geo(
     run: Run, out: Annotated[Path, Argument(help="File to write: .csv, or .geojson.")], capture: Capture = None
 ) -> None:
     """Write latitude, longitude, altitude and heading of the queries of a run in maps with GPS."""
 
 
-@exporter("exif", "pictures", "geo")
+@exporter("exif", "pictures")
 def export_exif(
     run: Run,
     out: Annotated[Path, Argument(help="Folder for copies of the pictures.")],

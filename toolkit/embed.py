@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
-from toolkit.capture.images import default_workers, prefetch, read_image
-from toolkit.capture.upright import turn_image, upright_turns
+from toolkit.capture.images import default_workers, prefetch, read_image, turn_image
+from toolkit.capture.upright import upright_turns
 from toolkit.embedders import WEIGHTS, Embedder, create_embedder, resolve_model, shows_upright
 from toolkit.errors import CaptureError, ImageError, ManifestError, ToolkitError
-from toolkit.features.features import LocalFeatures
-from toolkit.features.sift import SiftExtractor
+from toolkit.features.features import LocalFeatures, SiftExtractor
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import (
     file_fingerprint,

@@ -13,11 +13,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from toolkit.capture import Capture, Session, Trajectory
-from toolkit.capture.devices import in_order
+from toolkit.capture.names import in_order
 from toolkit.capture.tables import POSES_UNIT
 from toolkit.errors import ArtifactError, CaptureError, ToolkitError
-from toolkit.figures.evaluation import Evaluation, draw_evaluation
-from toolkit.figures.sequences import SequencePair, warn_of_older
+from toolkit.figures.evaluation import Evaluation, SequencePair, draw_evaluation, warn_of_older
 from toolkit.figures.style import save_figure
 from toolkit.files import (
     map_record_path,
@@ -31,7 +30,7 @@ from toolkit.files import (
 )
 from toolkit.geometry import Floats
 from toolkit.manifest import EvaluateSettings
-from toolkit.pose.result import Status, status_counts, statuses
+from toolkit.pose.base import Status, status_counts, statuses
 from toolkit.results import metrics
 from toolkit.results.metrics import is_posed, pose_errors
 from toolkit.results.metrics import recall as recall  # for callers

@@ -39,19 +39,17 @@ from toolkit.files import (
 from toolkit.geometry import Ints
 from toolkit.manifest import LocalizeSettings
 from toolkit.mapping.build import map_settings
-from toolkit.pose.base import Query, QueryInput, References
-from toolkit.pose.intrinsics_check import MAX_SHARES, SIGNIFICANCE
+from toolkit.pose.base import Query, QueryInput, QueryResult, References, status_counts
 from toolkit.pose.pnp import PNP_FORMAT
-from toolkit.pose.result import QueryResult, status_counts
+from toolkit.pose.rig import MAX_SHARES, SIGNIFICANCE
 from toolkit.prediction.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
-from toolkit.prediction.lifting import lifts
+from toolkit.prediction.hybrid import lifts
 from toolkit.prediction.network import open_predictor
 from toolkit.results.metrics import camera_messages
-from toolkit.results.opening import MAPS, attributes, session_fingerprint, update_attributes
-from toolkit.results.pair import query_group
+from toolkit.results.pair import MAPS, attributes, query_group, session_fingerprint, update_attributes
 from toolkit.runs.pairs import PairRows
 from toolkit.scene.map import FEW_REFERENCES, WITHOUT_FEATURES, Map, create_methods, localize_image, needs_upright
-from toolkit.scene.stored import StoredQueries
+from toolkit.scene.run import StoredQueries
 from toolkit.store.hdf5 import write_groups
 from toolkit.store.items import Items, heals
 from toolkit.threads import fixed_sums

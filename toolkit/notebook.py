@@ -50,10 +50,9 @@ from toolkit.manifest import (
     nearest,
 )
 from toolkit.manifest.settings import explain
-from toolkit.runs.folder import LOG_VARIABLE, RECORD, counts_text, log_to
+from toolkit.runs.folder import LOG_VARIABLE, RECORD, TAKEN, counts_text, log_to
 from toolkit.runs.kernel import TEXT_BARS, Kernels, MemoryWatch, kernel_error
 from toolkit.runs.pairs import left_out_of
-from toolkit.runs.sweep import TAKEN
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -189,7 +188,7 @@ def sessions_of(run: str | None, sessions_root: str | None) -> tuple[Path, Path 
         if stages:
             return Path(stages[0]["parameters"]["sessions_root"]).expanduser().resolve(), found
         if not is_demo(found):
-            from toolkit.results.opening import no_such_run  # takes half a second, for an error alone
+            from toolkit.results.pair import no_such_run  # takes half a second, for an error alone
 
             raise no_such_run(found)
     if sessions_root is not None:

@@ -19,8 +19,8 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from toolkit.capture.devices import extra_devices, table_record
-from toolkit.capture.names import allow_outside
+from toolkit.capture.names import allow_outside, extra_devices, table_record
+from toolkit.datasets.download import is_unfinished
 from toolkit.embedders import WEIGHTS as EMBEDDER_WEIGHTS
 from toolkit.embedders import resolve_model
 from toolkit.errors import (
@@ -33,7 +33,6 @@ from toolkit.errors import (
     require_packages,
     sentence,
 )
-from toolkit.exchange.download import is_unfinished
 from toolkit.features.matching import local_weights, resolve_auto
 from toolkit.files import (
     SceneFiles,
@@ -72,11 +71,23 @@ from toolkit.notebook import (
     notebook_path,
     work_seconds,
 )
-from toolkit.prediction.architectures import ARCHITECTURES
+from toolkit.prediction.interface import ARCHITECTURES
 from toolkit.runs.cluster import open_cluster
-from toolkit.runs.folder import LOG, OLDER, RECORD, RunLog, counts_text, failures, held, warnings_of_kernels
+from toolkit.runs.folder import (
+    LOG,
+    OLDER,
+    RECORD,
+    RunLog,
+    changed_keys,
+    counts_text,
+    failures,
+    held,
+    swept_runs,
+    take_over,
+    variant_name,
+    warnings_of_kernels,
+)
 from toolkit.runs.kernel import Kernels
-from toolkit.runs.sweep import changed_keys, swept_runs, take_over, variant_name
 
 if TYPE_CHECKING:
     from toolkit.scene.run import Run
@@ -282,7 +293,7 @@ def sweep(
     If a run fails, the next ones still run.
 
     Args:
-        sweeps: `key=a,b,c` each, see `runs.sweep.swept_runs`; several keys give all combinations of their values.
+        sweeps: `key=a,b,c` each, see `runs.folder.swept_runs`; several keys give all combinations of their values.
         manifest_path, overrides, say, only, force, cluster: as for `run`.
 
     Returns:

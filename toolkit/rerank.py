@@ -22,9 +22,8 @@ from toolkit.capture.images import default_workers, prefetch
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import INTERNAL, ArtifactError, reason_of
 from toolkit.features.features import KINDS
-from toolkit.features.matching import LocalMethod, create_local_methods, resolve_auto
+from toolkit.features.matching import LocalMethod, Verifier, create_local_methods, resolve_auto
 from toolkit.features.stores import FeatureStore, extract_session
-from toolkit.features.verification import Verifier
 from toolkit.files import (
     file_fingerprint,
     fingerprint,

@@ -19,9 +19,16 @@ from toolkit.capture.masks import Masks, combine, gps_masks, pose_masks, radio_m
 from toolkit.capture.session import SUBSESSIONS
 from toolkit.capture.tables import SIGNALS
 from toolkit.embedders import Vectors, embedding_folders, load_embeddings, open_descriptors
-from toolkit.embedders.index import EXACT, is_index_current, make_index
-from toolkit.embedders.search import Backend, Found, search
-from toolkit.embedders.stored import matrix_fingerprints, require_same_embedder
+from toolkit.embedders.search import (
+    EXACT,
+    Backend,
+    Found,
+    is_index_current,
+    make_index,
+    matrix_fingerprints,
+    require_same_embedder,
+    search,
+)
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
 from toolkit.files import file_fingerprint, fingerprint, is_current, pair_name, write_atomic, write_sidecar
 from toolkit.geometry import Ints

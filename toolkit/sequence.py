@@ -33,8 +33,7 @@ from toolkit.files import (
 )
 from toolkit.geometry import Floats, Ints, pose_error
 from toolkit.manifest import SequenceSettings
-from toolkit.pose.base import RoughPose
-from toolkit.pose.result import QueryResult, Status, status_counts, stds_of
+from toolkit.pose.base import QueryResult, RoughPose, Status, status_counts, stds_of
 from toolkit.results.pair import PairResults
 from toolkit.scene.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
 from toolkit.scene.map import Map

@@ -14,8 +14,8 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, DamagedError
+from toolkit.figures.evaluation import SequencePair, draw_sequence, warn_of_older
 from toolkit.figures.query_images import WorstQuery, draw_localization, draw_worst
-from toolkit.figures.sequences import SequencePair, draw_sequence, warn_of_older
 from toolkit.figures.style import save_figure
 from toolkit.figures.top_view import draw_scene
 from toolkit.files import pair_name, require_current, sidecar_path, write_sidecar

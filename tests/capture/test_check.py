@@ -10,7 +10,7 @@ from PIL import Image
 
 from toolkit.capture import Trajectory, write_session
 from toolkit.capture.check import check_capture
-from toolkit.capture.folder import IMPORT_RECORD
+from toolkit.capture.session import IMPORT_RECORD
 from toolkit.errors import CaptureError
 
 CAPTURES = Path(__file__).parents[2].parent / "shared" / "data" / "captures"

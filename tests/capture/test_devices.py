@@ -11,7 +11,8 @@ import pandas as pd
 import pytest
 
 from toolkit import pipeline
-from toolkit.capture import Capture, Trajectory, devices, write_session
+from toolkit.capture import Capture, Trajectory, write_session
+from toolkit.capture import names as devices
 from toolkit.capture.check import check_capture
 from toolkit.embed import embed_sessions
 from toolkit.errors import CaptureError, ManifestError
@@ -134,7 +135,7 @@ def test_a_run_hands_its_kinds_to_its_notebooks(tmp_path: Path, monkeypatch: pyt
     seen = []
 
     def started(*_: object) -> Path:
-        command = "from toolkit.capture.devices import kinds; print(*[kind.key for kind in kinds()])"
+        command = "from toolkit.capture.names import kinds; print(*[kind.key for kind in kinds()])"
         seen.append(subprocess.run([sys.executable, "-c", command], capture_output=True, text=True).stdout.split())
         return tmp_path
 

@@ -22,9 +22,9 @@ from toolkit.capture.names import (
     outside_allowed,
     require_name,
 )
+from toolkit.datasets.download import arrange
 from toolkit.embed import embed_sessions
 from toolkit.errors import CaptureError, ManifestError
-from toolkit.exchange.download import arrange
 from toolkit.exchange.interchange import import_images
 from toolkit.features.stores import extract_session
 from toolkit.manifest import load_manifest

@@ -2,7 +2,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from toolkit.capture.upright import turn_image, turn_points, turned_from_cam
+from toolkit.capture.images import turn_image, turn_points, turned_from_cam
 from toolkit.geometry import invert, make_pose, transform
 
 

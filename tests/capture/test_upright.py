@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from toolkit.capture import Capture, Session, Trajectory, write_session
-from toolkit.capture.upright import estimate_world_up, quarter_turns, turned_from_cam, up_of_cameras
+from toolkit.capture.images import turned_from_cam
+from toolkit.capture.upright import estimate_world_up, quarter_turns, up_of_cameras
 from toolkit.errors import CaptureError
 from toolkit.geometry import invert, make_pose
 

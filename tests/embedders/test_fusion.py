@@ -11,11 +11,9 @@ import pytest
 
 from toolkit.capture.masks import Masks
 from toolkit.embed import embed_sessions
-from toolkit.embedders import EMBEDDERS, load_embeddings, stored
+from toolkit.embedders import EMBEDDERS, MANIFEST_COLUMNS, load_embeddings
 from toolkit.embedders import search as search_module
-from toolkit.embedders.index import VectorIndex
-from toolkit.embedders.search import fuse, search
-from toolkit.embedders.stored import Vectors, open_descriptors
+from toolkit.embedders.search import VectorIndex, Vectors, fuse, open_descriptors, search
 from toolkit.errors import ArtifactError, ManifestError, WeightsError
 from toolkit.figures.explore import draw_similarity
 from toolkit.geometry import unit
@@ -156,7 +154,7 @@ def test_descriptors_on_disk_are_those_of_images_that_have_all(tmp_path: Path) -
         matrices[name] = rng.normal(size=(5, 3 if name == "one" else 4)).astype(np.float16)
         np.save(folder / "a.npy", matrices[name])
         lines = [f"{row},d,c,{image},{names[image]}" for row, image in enumerate(images)]
-        (folder / "manifest.csv").write_text("\n".join([",".join(stored.MANIFEST_COLUMNS), *lines]) + "\n")
+        (folder / "manifest.csv").write_text("\n".join([",".join(MANIFEST_COLUMNS), *lines]) + "\n")
     (tmp_path / "settings.json").write_text(json.dumps({"model": ["one", "two"]}))
     vectors, table = open_descriptors(tmp_path, "ios_map", normalize=True)
     assert table["abs_path"].tolist() == [names[number] for number in (0, 1, 2, 5)]

@@ -17,7 +17,7 @@ from tests.rendered import LIST, prepared
 from toolkit.__main__ import app
 from toolkit.capture import Capture
 from toolkit.errors import CaptureError, ManifestError
-from toolkit.exchange.geo import export_exif, export_geo, geo_table
+from toolkit.exchange.export import export_exif, export_geo, geo_table
 from toolkit.exchange.georeference import GEO_COLUMNS, east_north_up, geographic, geographic_poses, origin_of
 from toolkit.exchange.photographs import gather
 from toolkit.geometry import Floats, make_pose

@@ -14,9 +14,8 @@ from toolkit import files
 from toolkit.capture import Capture
 from toolkit.capture.check import check_capture
 from toolkit.errors import CaptureError
-from toolkit.exchange.grow import add_recording, remove_recording
-from toolkit.exchange.reconstruct import RECORD, reconstruct
-from toolkit.features.sift import SiftExtractor
+from toolkit.exchange.reconstruct import RECORD, add_recording, reconstruct, remove_recording
+from toolkit.features.features import SiftExtractor
 from toolkit.features.stores import extract_session
 from toolkit.files import read_json
 

@@ -14,7 +14,7 @@ from tests.rendered import copy_shared
 from toolkit.__main__ import app
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError
-from toolkit.exchange.hloc import export_features, export_matches, import_features, import_matches
+from toolkit.exchange.export import export_features, export_matches, import_features, import_matches
 from toolkit.features.features import LocalFeatures
 from toolkit.features.matching import MutualMatcher, PairMatches, unit_descriptors
 from toolkit.features.stores import (

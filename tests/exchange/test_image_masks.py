@@ -12,9 +12,8 @@ from toolkit.capture.images import find_mask
 from toolkit.errors import CaptureError, ImageError
 from toolkit.exchange.interchange import import_images
 from toolkit.exchange.photographs import gather
-from toolkit.features.features import usable
+from toolkit.features.features import SiftExtractor, usable
 from toolkit.features.matching import create_local_methods, resolve_auto
-from toolkit.features.sift import SiftExtractor
 from toolkit.features.stores import extract_session
 from toolkit.manifest import LocalizeSettings
 from toolkit.scene.map import Map

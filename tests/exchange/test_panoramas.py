@@ -9,18 +9,16 @@ import pycolmap
 import pytest
 
 from toolkit.capture import Capture, parse_camera
-from toolkit.capture.cameras import invertible, rays_of, sees_all, view_bounds
+from toolkit.capture.images import invertible, rays_of, sees_all, view_bounds
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import CaptureError
-from toolkit.exchange.interchange import import_colmap
-from toolkit.exchange.panoramas import YAWS_DEG, import_panoramas
+from toolkit.exchange.interchange import YAWS_DEG, import_colmap, import_panoramas
 from toolkit.features.features import LocalFeatures, usable
 from toolkit.geometry import Floats, invert, make_pose, qt_from_pose, quaternion_to_rotation
 from toolkit.pipeline import run
 from toolkit.scene import Run
-from toolkit.synthetic.devices import looking
-from toolkit.synthetic.render import Rays, paint, render
-from toolkit.synthetic.scene import Scene, build_room
+from toolkit.synthetic.capture import looking
+from toolkit.synthetic.render import Rays, Scene, build_room, paint, render
 
 WIDTH = 2048
 

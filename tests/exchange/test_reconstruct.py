@@ -13,13 +13,12 @@ from typer.testing import CliRunner
 
 from toolkit.__main__ import app
 from toolkit.capture import Capture
-from toolkit.capture.cameras import camera_text
+from toolkit.capture.images import camera_text
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange import reconstruct as module
-from toolkit.exchange.grow import add_recording
 from toolkit.exchange.photographs import choose_frames, gather, initial_cameras
-from toolkit.exchange.reconstruct import reconstruct
-from toolkit.features.sift import SiftExtractor
+from toolkit.exchange.reconstruct import add_recording, reconstruct
+from toolkit.features.features import SiftExtractor
 from toolkit.features.stores import extract_session, features_path
 from toolkit.files import read_json
 from toolkit.geometry import Floats, qt_from_pose

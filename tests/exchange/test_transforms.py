@@ -16,7 +16,7 @@ from toolkit.capture import Capture, Session
 from toolkit.capture.check import check_capture
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.drafts import list_images
-from toolkit.exchange.transforms import import_transforms
+from toolkit.exchange.interchange import import_transforms
 from toolkit.geometry import invert, make_pose, quaternion_to_rotation, transform
 
 SIZE = (64, 48)

@@ -3,8 +3,7 @@
 import pytest
 
 from toolkit.errors import ManifestError
-from toolkit.features.features import create_extractor
-from toolkit.features.sift import SiftExtractor
+from toolkit.features.features import SiftExtractor, create_extractor
 from toolkit.manifest import FeaturesSettings, SiftSettings
 
 

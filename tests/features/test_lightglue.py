@@ -11,8 +11,8 @@ import torch
 
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
 from toolkit.features.features import LocalFeatures
-from toolkit.features.lightglue import LightGlueMatcher, _pack
 from toolkit.features.matching import PairMatches
+from toolkit.features.network import LightGlueMatcher, _pack
 
 transformers = pytest.importorskip("transformers", reason="needs the extra `learned`")
 

@@ -9,10 +9,16 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from toolkit.features import sift
-from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, LocalFeatures
+from toolkit.features import features as sift
+from toolkit.features.features import (
+    DESCRIPTOR_SCALE,
+    KINDS,
+    LocalFeatures,
+    SiftExtractor,
+    SiftSettings,
+    stretch_contrast,
+)
 from toolkit.features.matching import mutual_matches, unit_descriptors
-from toolkit.features.sift import SiftExtractor, SiftSettings, stretch_contrast
 
 Described = tuple[NDArray[np.float32], NDArray[np.float32]]
 """Keypoints (N, 2) and unit descriptors (N, D)."""

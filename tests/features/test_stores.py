@@ -19,12 +19,11 @@ from toolkit.capture import Session, write_session
 from toolkit.capture.images import read_image
 from toolkit.errors import ArtifactError
 from toolkit.features import stores
-from toolkit.features.features import LocalFeatures
+from toolkit.features.features import LocalFeatures, SiftExtractor, SiftSettings
 from toolkit.features.matching import (
     MutualMatcher,
     PairMatches,
 )
-from toolkit.features.sift import SiftExtractor, SiftSettings
 from toolkit.features.stores import (
     FeatureStore,
     MatchStore,
@@ -260,7 +259,8 @@ def test_a_stopped_run_keeps_what_it_finished(
 KILLED = """
 import os, signal, sys
 import numpy as np
-from toolkit.features import sift, stores
+from toolkit.features import features as sift
+from toolkit.features import stores
 from toolkit.capture import Session
 from toolkit.store import items
 

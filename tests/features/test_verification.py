@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from toolkit.features.verification import epipolar_matches
+from toolkit.features.matching import epipolar_matches
 from toolkit.geometry import Floats
 
 

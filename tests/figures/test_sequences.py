@@ -12,7 +12,7 @@ from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.errors import ArtifactError
 from toolkit.evaluate import evaluate_scene
-from toolkit.figures.sequences import SequencePair, draw_sequence, draw_steps, warn_of_older
+from toolkit.figures.evaluation import SequencePair, draw_sequence, draw_steps, warn_of_older
 from toolkit.files import pair_name, why_older, write_sidecar
 from toolkit.sequence import sequence_pairs
 

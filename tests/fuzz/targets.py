@@ -24,11 +24,11 @@ from toolkit.capture import Capture, Session
 from toolkit.capture.check import check_capture
 from toolkit.capture.tables import read_query_table
 from toolkit.errors import ToolkitError
-from toolkit.exchange.hloc import import_features
+from toolkit.exchange.export import import_features
 from toolkit.exchange.interchange import import_colmap, import_images
 from toolkit.files import read_references
 from toolkit.manifest import load_manifest
-from toolkit.pose.result import Correspondences, QueryResult
+from toolkit.pose.base import Correspondences, QueryResult
 from toolkit.store.hdf5 import write_groups
 
 

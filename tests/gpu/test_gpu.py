@@ -27,8 +27,7 @@ from tests.models.test_megaloc import golden
 from toolkit import pipeline
 from toolkit.embedders.megaloc import MegaLocEmbedder
 from toolkit.errors import ToolkitError
-from toolkit.features.lightglue import LightGlueMatcher
-from toolkit.features.network import NetworkExtractor, SuperPointExtractor
+from toolkit.features.network import LightGlueMatcher, NetworkExtractor, SuperPointExtractor
 from toolkit.manifest import AlikedSettings
 from toolkit.models.compute import full_float32
 from toolkit.models.da3 import DepthAnything3, choose_reference

@@ -13,10 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory, write_session
-from toolkit.capture.cameras import in_view, invertible_share, rays_of, view_bounds
+from toolkit.capture.images import in_view, invertible_share, rays_of, view_bounds
 from toolkit.errors import ArtifactError
-from toolkit.features.features import KINDS
-from toolkit.features.sift import SiftExtractor, SiftSettings
+from toolkit.features.features import KINDS, SiftExtractor, SiftSettings
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import sidecar_path
 from toolkit.mapping import build as mapping

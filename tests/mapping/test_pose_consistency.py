@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
 from toolkit.capture import Capture, Trajectory
-from toolkit.capture.cameras import rays_of
-from toolkit.features.features import KINDS
-from toolkit.features.sift import SiftExtractor
+from toolkit.capture.images import rays_of
+from toolkit.features.features import KINDS, SiftExtractor
 from toolkit.features.stores import FeatureStore
 from toolkit.geometry import Floats
 from toolkit.mapping.build import build_map, instants

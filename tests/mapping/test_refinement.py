@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
 from toolkit.capture import Capture, Trajectory
-from toolkit.features.sift import SiftExtractor
+from toolkit.features.features import SiftExtractor
 from toolkit.features.stores import FeatureStore
 from toolkit.manifest import MapSettings
 from toolkit.mapping.build import build_map

@@ -8,7 +8,7 @@ import torch
 
 from toolkit.errors import WeightsError
 from toolkit.features.features import LocalFeatures
-from toolkit.features.lightglue import LightGlueMatcher
+from toolkit.features.network import LightGlueMatcher
 from toolkit.models import lightglue
 from toolkit.models.lightglue import DIM, LightGlue, official_names
 

@@ -20,7 +20,7 @@ from tests.models.test_vggt import (
     picture,
 )
 from toolkit.errors import ImageError, WeightsError
-from toolkit.models.dpt import ResidualUnit
+from toolkit.models.multiview import ResidualUnit
 from toolkit.models.omega import HEADS, SPECIAL, PlaceRope, VGGTOmega, cameras_from_pose_encoding, load_images
 
 __all__ = ["golden"]  # a fixture

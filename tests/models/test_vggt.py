@@ -16,7 +16,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from toolkit.errors import ImageError, WeightsError
-from toolkit.models.dpt import add_position, dense_output
+from toolkit.models.multiview import add_position, dense_output
 from toolkit.models.vggt import (
     HEADS,
     SPECIAL,

@@ -15,10 +15,9 @@ from toolkit import geometry
 from toolkit.features.features import KINDS, LocalFeatures
 from toolkit.features.matching import LocalMethod, Matcher, MutualMatcher, PairMatches
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.base import References
+from toolkit.pose.base import QueryResult, References
 from toolkit.pose.local_triangulation import OnDemandLocalizer, PosedImages
 from toolkit.pose.map_matching import MappedFeatures
-from toolkit.pose.result import QueryResult
 
 Floats = NDArray[np.float64]
 SIZE = (640, 480)

@@ -20,10 +20,9 @@ from toolkit.manifest import PnpSettings
 from toolkit.mapping.local_map import LocalMap
 from toolkit.pose import map_matching as matches
 from toolkit.pose import pnp
-from toolkit.pose.base import Prior, References
+from toolkit.pose.base import CAMERA, Prior, QueryResult, References, Status
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import FIRST_REFERENCES, GUIDED_WEIGHT, VIEWS, PnpLocalizer, _Hypothesis, _support
-from toolkit.pose.result import CAMERA, QueryResult, Status
 from toolkit.pose.rig import Matches, RigQuery, least_squares_covariance
 
 Floats = NDArray[np.float64]

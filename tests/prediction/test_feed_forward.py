@@ -21,8 +21,7 @@ from toolkit.figures.prediction import draw_prediction
 from toolkit.figures.style import save_figure
 from toolkit.files import SceneFiles
 from toolkit.localize import COLUMNS, PREDICTION_COLUMNS
-from toolkit.pose.base import Query, QueryInput, References, View
-from toolkit.pose.result import QueryResult
+from toolkit.pose.base import Query, QueryInput, QueryResult, References, View
 from toolkit.prediction.feed_forward import (
     MAX_DEPTH_POINTS,
     FeedForwardAnswer,
@@ -30,8 +29,7 @@ from toolkit.prediction.feed_forward import (
     QueryPrediction,
 )
 from toolkit.prediction.interface import Prediction
-from toolkit.prediction.network import _warn_of_simulation
-from toolkit.prediction.simulated import SimulatedPredictor
+from toolkit.prediction.network import SimulatedPredictor, _warn_of_simulation
 from toolkit.store.items import Items
 
 Floats = NDArray[np.float64]

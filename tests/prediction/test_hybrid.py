@@ -17,10 +17,9 @@ from toolkit.capture import Capture, Trajectory
 from toolkit.features.matching import MutualMatcher
 from toolkit.features.stores import extract_session
 from toolkit.files import SceneFiles
-from toolkit.pose.base import Prior, QueryInput, References
+from toolkit.pose.base import Prior, QueryInput, QueryResult, References, Status
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer
-from toolkit.pose.result import QueryResult, Status
 from toolkit.prediction.feed_forward import FeedForwardAnswer
 from toolkit.prediction.hybrid import HybridLocalizer
 

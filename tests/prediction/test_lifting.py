@@ -22,15 +22,13 @@ from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import SceneFiles, write_text
 from toolkit.localize import localize_pairs
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.base import Query, References, View
+from toolkit.pose.base import Query, QueryResult, References, View
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer
-from toolkit.pose.result import QueryResult
 from toolkit.prediction.feed_forward import FeedForwardAnswer, FeedForwardLocalizer, QueryPrediction
-from toolkit.prediction.hybrid import HybridLocalizer
+from toolkit.prediction.hybrid import DepthLifter, HybridLocalizer
 from toolkit.prediction.interface import Prediction
-from toolkit.prediction.lifting import DepthLifter
-from toolkit.prediction.simulated import SimulatedPredictor
+from toolkit.prediction.network import SimulatedPredictor
 
 Floats = NDArray[np.float64]
 NOISE = {"rotation_noise_deg": 0.3, "position_noise_m": 0.01, "depth_noise": 0.02}

@@ -12,7 +12,7 @@ import pytest
 from tests.localized import read_queries, some_correspondences, stored, write_queries
 from toolkit.errors import ArtifactError
 from toolkit.geometry import make_pose
-from toolkit.pose.result import QueryResult, Rival, Status
+from toolkit.pose.base import QueryResult, Rival, Status
 from toolkit.results.pair import PairResults
 from toolkit.store.hdf5 import CHECKSUM
 

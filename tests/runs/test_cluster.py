@@ -26,7 +26,7 @@ from toolkit.capture import Capture
 from toolkit.capture.names import ALLOW_OUTSIDE
 from toolkit.embed import embed_sessions
 from toolkit.errors import DamagedError, ImageError, ManifestError, ToolkitError
-from toolkit.features.sift import SiftExtractor
+from toolkit.features.features import SiftExtractor
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import Remade, SceneFiles
 from toolkit.localize import localize_pairs

@@ -12,8 +12,7 @@ from toolkit.errors import ManifestError
 from toolkit.files import SceneFiles, write_text
 from toolkit.manifest import Manifest, load_manifest
 from toolkit.pipeline import sweep
-from toolkit.runs.folder import RunLog
-from toolkit.runs.sweep import changed_keys, swept_runs, take_over, variant_name
+from toolkit.runs.folder import RunLog, changed_keys, swept_runs, take_over, variant_name
 from toolkit.store.items import Items
 
 

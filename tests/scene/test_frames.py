@@ -12,11 +12,10 @@ import pytest
 from tests.sequences.drifting import Drive, drive, lost_in_a_gap
 from toolkit import geometry
 from toolkit.errors import CameraError, ImageError
+from toolkit.features.features import SiftExtractor
 from toolkit.features.matching import LocalMethod, MutualMatcher
-from toolkit.features.sift import SiftExtractor
 from toolkit.manifest import LocalizeSettings, SequenceSettings
-from toolkit.pose.base import RoughPose
-from toolkit.pose.result import QueryResult, Status
+from toolkit.pose.base import QueryResult, RoughPose, Status
 from toolkit.scene import frames
 from toolkit.scene.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
 from toolkit.scene.map import Map

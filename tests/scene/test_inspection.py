@@ -21,8 +21,8 @@ from toolkit.figures.query_images import shown_name
 from toolkit.files import SceneFiles, map_record_path
 from toolkit.geometry import invert
 from toolkit.manifest import LocalizeSettings
-from toolkit.pose.result import CAMERA, QueryResult, Rival, Status
-from toolkit.scene.inspection import (
+from toolkit.pose.base import CAMERA, QueryResult, Rival, Status
+from toolkit.scene.run import (
     Choice,
     InspectedPair,
     WorstQueries,
@@ -52,7 +52,7 @@ def written(
     """A pair written by hand, its attributes like those of a run."""
     import h5py
 
-    from toolkit.results.opening import RETRIEVAL, SESSIONS_ROOT, SETTINGS
+    from toolkit.results.pair import RETRIEVAL, SESSIONS_ROOT, SETTINGS
 
     poses = folder / capture.name / "poses"
     stem = write_pair(Capture.open(capture), poses, "ios", device, queries, **columns)  # type: ignore[arg-type]

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from tests.pose.test_local_triangulation import Scene
 from toolkit.features.features import LocalFeatures
 from toolkit.manifest import LocalizeSettings
-from toolkit.pose.base import Localizer, Prior, Query, QueryMatches, References
-from toolkit.pose.result import CAMERA, QueryResult, Rival, Status
+from toolkit.pose.base import CAMERA, Localizer, Prior, Query, QueryMatches, QueryResult, References, Rival, Status
 from toolkit.scene.map import Map, localize_images
 
 

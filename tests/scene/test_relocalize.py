@@ -14,12 +14,12 @@ from toolkit.capture import Session
 from toolkit.errors import ArtifactError
 from toolkit.files import SceneFiles
 from toolkit.manifest import LocalizeSettings
-from toolkit.pose.result import QueryResult
+from toolkit.pose.base import QueryResult
 from toolkit.prediction import network as predictors
-from toolkit.prediction.simulated import SimulatedPredictor
+from toolkit.prediction.network import SimulatedPredictor
 from toolkit.scene import map as maps
 from toolkit.scene.map import WITHOUT_FEATURES, Map
-from toolkit.scene.stored import StoredQueries
+from toolkit.scene.run import StoredQueries
 
 SIMULATED = {"name": "simulated"}
 

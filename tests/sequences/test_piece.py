@@ -9,8 +9,7 @@ import pytest
 from tests.sequences.drifting import Drive, drive
 from toolkit import geometry
 from toolkit.manifest import SequenceSettings
-from toolkit.pose.base import RoughPose
-from toolkit.pose.result import QueryResult, Status
+from toolkit.pose.base import QueryResult, RoughPose, Status
 from toolkit.sequences.odometry import PosedQueries
 from toolkit.sequences.pose_graph import STEPS, localize_piece, with_relocalized
 

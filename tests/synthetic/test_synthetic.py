@@ -23,11 +23,13 @@ from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.geometry import invert, make_pose, rotation_angle_deg, transform
 from toolkit.synthetic import capture as capture_writing
 from toolkit.synthetic import render_capture, textures
-from toolkit.synthetic.capture import HARD, WRONG_FOCAL, World
-from toolkit.synthetic.devices import (
+from toolkit.synthetic.capture import (
     DEVICES,
+    HARD,
+    WRONG_FOCAL,
     Emitter,
     Sensor,
+    World,
     emitters_of,
     looking,
     odometry_of,
@@ -35,8 +37,7 @@ from toolkit.synthetic.devices import (
     scans,
     walks,
 )
-from toolkit.synthetic.render import Rays, paint, render
-from toolkit.synthetic.scene import Quad, Scene, build_room
+from toolkit.synthetic.render import Quad, Rays, Scene, build_room, paint, render
 
 
 def coarse_room(seed: int, index: int, look: int | None = None) -> Scene:

@@ -17,8 +17,7 @@ from toolkit.errors import ArtifactError, CaptureError
 from toolkit.geometry import make_pose, quaternion_to_rotation
 from toolkit.mapping.local_map import LocalMap
 from toolkit.results.localized import Localizations, QueryDetails, ShownImage
-from toolkit.viewer.blueprint import scene_view, shown_intrinsics, small_jpeg, spawn_viewer
-from toolkit.viewer.queries import record_localizations
+from toolkit.viewer.queries import record_localizations, scene_view, shown_intrinsics, small_jpeg, spawn_viewer
 from toolkit.viewer.sessions import record_session, session_tracks
 
 START = 93_003_175_602  # microseconds, as captures count them
@@ -257,7 +256,7 @@ def test_a_folder_without_the_map_is_said(capture, tmp_path):
 
 def test_the_viewer_is_opened_when_asked_for(capture, tmp_path, monkeypatch):
     opened = []
-    monkeypatch.setattr("toolkit.viewer.blueprint.subprocess.Popen", lambda command, **_: opened.append(command))
+    monkeypatch.setattr("toolkit.viewer.queries.subprocess.Popen", lambda command, **_: opened.append(command))
     record_session(capture, "map", "ios", spawn=True, out=tmp_path / "a.rrd", progress=False)
     spawn_viewer("b.rrd")
     assert [command[-1] for command in opened] == [str(tmp_path / "a.rrd"), "b.rrd"]
@@ -275,7 +274,7 @@ def test_pictures_and_intrinsics_change_size_together():
 
 
 def test_a_localization_view_holds_the_queries(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr("toolkit.viewer.blueprint.IMAGE_SIZE", 64)
+    monkeypatch.setattr("toolkit.viewer.queries.IMAGE_SIZE", 64)
     rng = np.random.default_rng(0)
     session = Capture.open(capture)["hl_map"]
     camera, file = session.camera("morning/lf"), session.image_path(0)

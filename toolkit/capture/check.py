@@ -10,15 +10,21 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import KDTree
 
-from toolkit.capture.cameras import CAMERA_TYPES, parse_camera
-from toolkit.capture.devices import OTHER_SESSIONS, SPLITS, kinds
-from toolkit.capture.folder import IMPORT_RECORD, Capture
-from toolkit.capture.images import default_workers, prefetch, read_image, stored_size
-from toolkit.capture.names import HOW_TO_ALLOW, has_long_part
-from toolkit.capture.session import RAW_DATA, SUBSESSIONS, Session
-from toolkit.capture.tables import ALIGNED, COLUMNS, POSE_NAMES, SIGNALS, KeyIndex, key_of, read_table, times_of
+from toolkit.capture.images import CAMERA_TYPES, default_workers, parse_camera, prefetch, read_image, stored_size
+from toolkit.capture.names import HOW_TO_ALLOW, OTHER_SESSIONS, SPLITS, has_long_part, kinds
+from toolkit.capture.session import IMPORT_RECORD, RAW_DATA, SUBSESSIONS, Capture, Session
+from toolkit.capture.tables import (
+    ALIGNED,
+    COLUMNS,
+    POSE_NAMES,
+    SIGNALS,
+    KeyIndex,
+    key_of,
+    read_depth,
+    read_table,
+    times_of,
+)
 from toolkit.capture.upright import estimate_world_up, posed_photographs
-from toolkit.capture.writing import read_depth
 from toolkit.errors import COMMAND, CaptureError, ImageError
 from toolkit.files import read_json
 from toolkit.geometry import unit

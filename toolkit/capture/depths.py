@@ -22,9 +22,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from toolkit import geometry
-from toolkit.capture.cameras import in_view, rays_of, view_bounds
+from toolkit.capture.images import in_view, rays_of, view_bounds
 from toolkit.capture.session import RAW_DATA, Session
-from toolkit.capture.writing import read_depth
+from toolkit.capture.tables import read_depth
 from toolkit.errors import CaptureError
 from toolkit.geometry import Floats, Ints
 

@@ -18,8 +18,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from toolkit.capture.session import Session
-from toolkit.capture.tables import as_strings, codes_of, times_of
-from toolkit.capture.trajectory import Trajectory
+from toolkit.capture.tables import Trajectory, as_strings, codes_of, times_of
 from toolkit.geometry import Floats, Ints
 
 Bools = NDArray[np.bool_]

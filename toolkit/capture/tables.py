@@ -1,4 +1,5 @@
-"""Text tables of the capture format: their columns, a fast reader, and an index of rows by key.
+"""Text tables of the capture format: their columns, a fast reader, an index of rows by key; poses of devices over time;
+and the writer of a session's files, with its depth maps.
 
 The reader accepts comma-separated values with `#` comments and blank lines anywhere, spaces around values, Windows line
 ends and a byte-order mark. Columns beyond the expected ones are ignored or kept as one text; their number varies from
@@ -8,26 +9,25 @@ convert the columns. Only malformed values are looked at one by one, and error m
 
 import errno
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.names import EXPECTED_NAME, HOW_TO_ALLOW, bad_names, outside_allowed
-from toolkit.errors import COMMAND, ArtifactError, CaptureError
+from toolkit.errors import COMMAND, ArtifactError, CaptureError, ImageError
 from toolkit.files import write_atomic
-from toolkit.geometry import Floats, Ints
+from toolkit.geometry import Floats, Ints, pose_from_qt, qt_from_pose
 
 log = logging.getLogger(__name__)
-
 Columns = Sequence[tuple[str, str]]
-
 # Column types. METERS is a bounded coordinate, ID a valid name, PATH the path of an image, TEXT any text.
 INTEGER, NUMBER, METERS, LATITUDE, LONGITUDE = "integer", "finite number", "meters", "latitude", "longitude"
 ID, PATH, TEXT = "id", "path", "text"
@@ -56,6 +56,24 @@ COLUMNS: dict[str, Columns] = {
 """Names and types of the columns of each file of a session. Further columns of wifi.txt and bt.txt (name, times of the
 scan) are not used."""
 SIGNALS = ("wifi.txt", "bt.txt")  # files whose keys may repeat, because a scan may receive an emitter several times
+_TYPES: dict[str, tuple[pa.DataType, float | None, str]] = {
+    INTEGER: (pa.int64(), None, "an integer (microseconds)"),
+    NUMBER: (pa.float64(), np.inf, "a finite number"),
+    METERS: (pa.float64(), FARTHEST_M, f"a finite number of meters, at most {FARTHEST_M:.0e}"),
+    LATITUDE: (pa.float64(), 90.0, "degrees from -90 to 90"),
+    LONGITUDE: (pa.float64(), 180.0, "degrees from -180 to 180"),
+    ID: (pa.large_string(), None, EXPECTED_NAME),
+    PATH: (pa.large_string(), None, f"{EXPECTED_NAME}, below raw_data/ (for your own files elsewhere, {HOW_TO_ALLOW})"),
+    TEXT: (pa.large_string(), None, "any text"),
+}
+"""Type in memory, largest absolute value, and what is expected, for messages, of each type of column."""
+POSES_UNIT = {"position_std": "position_std_m", "moved": "moved_m"}
+"""Columns of lengths in a pair's table if the unit of its poses is unknown, and their names where it is the meter."""
+UNKNOWN_DEPTH = 65535
+DEPTH_SCALE = 1000.0  # depth maps are 16-bit PNGs in millimeters
+_WIFI = "mac_addr, frequency_khz, rssi_dbm, name, scan_time_start_us, scan_time_end_us"
+_BLUETOOTH = "id, rssi_dbm, name"
+Records: TypeAlias = pd.DataFrame | Iterable[tuple[int, str, str]]
 
 
 def key_of(file: str) -> list[str]:
@@ -144,19 +162,6 @@ def read_table(path: Path, columns: Columns, strict: bool = True, extra: bool = 
     more = f" ({len(table.problems) - 1} more such lines.)" if len(table.problems) > 1 else ""
     advice = f"Correct or remove the line; `{COMMAND} check CAPTURE` lists all problems.{more}"
     raise CaptureError(f"{path}, line {line}: {fault}. {advice}")
-
-
-_TYPES: dict[str, tuple[pa.DataType, float | None, str]] = {
-    INTEGER: (pa.int64(), None, "an integer (microseconds)"),
-    NUMBER: (pa.float64(), np.inf, "a finite number"),
-    METERS: (pa.float64(), FARTHEST_M, f"a finite number of meters, at most {FARTHEST_M:.0e}"),
-    LATITUDE: (pa.float64(), 90.0, "degrees from -90 to 90"),
-    LONGITUDE: (pa.float64(), 180.0, "degrees from -180 to 180"),
-    ID: (pa.large_string(), None, EXPECTED_NAME),
-    PATH: (pa.large_string(), None, f"{EXPECTED_NAME}, below raw_data/ (for your own files elsewhere, {HOW_TO_ALLOW})"),
-    TEXT: (pa.large_string(), None, "any text"),
-}
-"""Type in memory, largest absolute value, and what is expected, for messages, of each type of column."""
 
 
 def _layout(columns: Columns) -> str:
@@ -309,10 +314,6 @@ class KeyIndex:
         return [self._order[start:end] for start, end in zip(starts, ends, strict=True)]
 
 
-POSES_UNIT = {"position_std": "position_std_m", "moved": "moved_m"}
-"""Columns of lengths in a pair's table if the unit of its poses is unknown, and their names where it is the meter."""
-
-
 def in_unit_of_poses(table: pd.DataFrame, unit: str | None) -> pd.DataFrame:
     """Return a pair's table as it is written: in an unknown unit (None), no name says meters, `unit` is `unknown`."""
     if unit is not None:
@@ -341,3 +342,222 @@ def write_table(path: Path, header: str | None, rows: Iterable[str]) -> None:
         if header is not None:
             stream.write(f"# {header}\n")
         stream.writelines(f"{row}\n" for row in rows)
+
+
+# Poses of devices
+
+
+class Trajectory:
+    """Poses of devices over time, world_from_device.
+
+    Attributes:
+        timestamps: (N,) int64 microseconds.
+        qt: (N, 7) float64, qw qx qy qz tx ty tz, as in the file.
+        arrow_ids: N device ids as an Arrow array.
+    """
+
+    def __init__(
+        self,
+        timestamps: ArrayLike,
+        device_ids: Any,
+        qt: ArrayLike,
+        covariances: ArrayLike | None = None,
+        source: Path | None = None,
+    ) -> None:
+        """Make a trajectory. Covariances are given, (N, 6, 6), or read from the file `source` at first use."""
+        self.timestamps = np.asarray(timestamps, np.int64)
+        self.arrow_ids = as_strings(device_ids)
+        self.qt = np.asarray(qt, np.float64).reshape(-1, 7)
+        if not len(self.timestamps) == len(self.arrow_ids) == len(self.qt):
+            found = f"{len(self.timestamps)}, {len(self.arrow_ids)} and {len(self.qt)}"
+            raise ValueError(f"Expected equally many timestamps, device ids and poses, got {found}.")
+        self._covariances = None if covariances is None else np.asarray(covariances, np.float64).reshape(-1, 6, 6)
+        self._source = source
+
+    @classmethod
+    def from_poses(
+        cls, timestamps: ArrayLike, device_ids: Any, world_from_device: ArrayLike, covariances: ArrayLike | None = None
+    ) -> "Trajectory":
+        """Make a trajectory from poses (N, 4, 4)."""
+        return cls(timestamps, device_ids, qt_from_pose(world_from_device), covariances)
+
+    @classmethod
+    def read(cls, path: str | Path) -> "Trajectory":
+        """Read a trajectories file. Columns after the pose are ignored unless they are a covariance.
+
+        Raises:
+            CaptureError: the file is missing or has a malformed line.
+        """
+        return cls.from_table(read_table(Path(path), COLUMNS["trajectories.txt"]))
+
+    @classmethod
+    def from_table(cls, table: TextTable) -> "Trajectory":
+        """Make a trajectory from the table of a trajectories file."""
+        source = table.path if table.has_extra and not table.problems else None
+        times, devices = table.columns["timestamp"].to_numpy(), table.columns["device_id"]
+        return cls(times, devices, table.numbers(POSE_NAMES), source=source)
+
+    def write(self, path: str | Path) -> None:
+        """Write the file atomically, with numbers that read back exactly. NaN covariances are omitted."""
+        covariances, values = self.covariances, self.qt.tolist()
+        if covariances is not None:
+            finite = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
+            flat = covariances.reshape(-1, 36).tolist()
+            values = [[*pose, *more] if has else pose for pose, more, has in zip(values, flat, finite, strict=True)]
+        rows = zip(self.timestamps.tolist(), self.arrow_ids.to_pylist(), values, strict=True)
+        lines = (f"{time}, {device}, {', '.join(map(repr, numbers))}" for time, device, numbers in rows)
+        write_table(Path(path), "timestamp, device_id, qw, qx, qy, qz, tx, ty, tz, *covar", lines)
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    @cached_property
+    def device_ids(self) -> NDArray[np.object_]:
+        """Device ids, (N,) array of str."""
+        return self.arrow_ids.to_numpy(zero_copy_only=False)
+
+    @property
+    def covariances(self) -> Floats | None:
+        """Pose covariances (N, 6, 6), NaN in rows without one; None without any. Read from the file at first use.
+
+        A covariance with a value that is not a finite number counts as none, with a warning.
+        """
+        if self._covariances is None and self._source is not None:
+            table = read_table(self._source, COLUMNS["trajectories.txt"], extra=True)
+            extra, self._source = table.columns["extra"], None
+            rows = np.flatnonzero(pc.equal(pc.count_substring(extra, ","), 35).to_numpy(zero_copy_only=False))
+            covariances = np.full((len(self), 6, 6), np.nan)
+            for block in np.split(rows, range(4096, len(rows), 4096)):  # bounds the memory
+                values = pc.split_pattern(extra.take(pa.array(block)), ",").flatten()
+                numbers, wrong = convert(pc.ascii_trim_whitespace(values), NUMBER)
+                finite = ~wrong.reshape(-1, 36).any(axis=1)
+                covariances[block[finite]] = numbers.to_numpy().reshape(-1, 6, 6)[finite]
+            malformed = rows[np.isnan(covariances[rows, 0, 0])]
+            if len(malformed):
+                more = f", and in {len(malformed) - 1} more lines" if len(malformed) > 1 else ""
+                fault = f"the covariance has values that are not finite numbers{more}; such a covariance is not used"
+                log.warning("%s: %s.", table.where(malformed[0]), fault)
+            self._covariances = covariances if len(rows) else None
+        return self._covariances
+
+    @property
+    def world_from_device(self) -> Floats:
+        """(N, 4, 4) float64, meters."""
+        return pose_from_qt(self.qt)
+
+    @cached_property
+    def index(self) -> KeyIndex:
+        """Index of the rows by (timestamp, device_id)."""
+        return KeyIndex(self.timestamps, self.arrow_ids)
+
+    def lookup(self, timestamps: ArrayLike, device_ids: Any) -> Floats:
+        """Return world_from_device, (n, 4, 4), for n keys; NaN for keys without a pose."""
+        rows = self.index.find(np.atleast_1d(np.asarray(timestamps, np.int64)), as_strings(device_ids))
+        poses = np.full((len(rows), 4, 4), np.nan)
+        poses[rows >= 0] = pose_from_qt(self.qt[rows[rows >= 0]])
+        return poses
+
+
+# The files of a session
+
+
+def write_session(
+    path: str | Path,
+    sensors: Iterable[Sequence[Any]],
+    rigs: Iterable[tuple[str, str, ArrayLike]] | None,
+    trajectory: Trajectory | None,
+    images: Records,
+    depths: Records | None = None,
+    subsessions: Sequence[str] | None = None,
+    keyframes: Mapping[str, pd.DataFrame] | None = None,
+    ground_truth: Trajectory | None = None,
+    wifi: Iterable[Sequence[Any]] | None = None,
+    bt: Iterable[Sequence[Any]] | None = None,
+) -> Path:
+    """Write the text files of a session, not its images. Return the folder.
+
+    Arguments that are None are not written. Raise ValueError if the format cannot store a value: it contains a comma or
+    a line break, begins or ends with a space, or starts a line with #.
+
+    Args:
+        path: the session's folder; created if missing.
+        sensors: rows (sensor_id, name, sensor_type, parameter, ...).
+        rigs: rows (rig_id, sensor_id, rig_from_sensor), the pose as (4, 4) or as qw qx qy qz tx ty tz.
+        trajectory: written to trajectories.txt: the poses of a map, or the odometry of queries.
+        images, depths: rows (timestamp, sensor_id, path relative to raw_data/).
+        keyframes: tables [timestamp, device_id] by name, e.g. `pruned_subsampled`.
+        ground_truth: written to proc/alignment_trajectories.txt.
+        wifi: rows (timestamp, sensor_id, MAC address, kHz, dBm, name, start and end of the scan, microseconds).
+        bt: rows (timestamp, sensor_id, id, dBm, name), the id as `<guid>:<major>:<minor>`.
+    """
+    path = Path(path)
+    write_table(path / "sensors.txt", "sensor_id, name, sensor_type, [sensor_params]+", map(_line, sensors))
+    if rigs is not None:
+        rows = (
+            (rig, sensor, *(qt_from_pose(pose) if np.shape(pose) == (4, 4) else np.asarray(pose, np.float64)).tolist())
+            for rig, sensor, pose in rigs
+        )
+        write_table(path / "rigs.txt", "rig_id, sensor_id, qw, qx, qy, qz, tx, ty, tz", map(_line, rows))
+    for file, column, records in (("images.txt", "image_path", images), ("depths.txt", "depth_path", depths)):
+        if records is not None:
+            lines = records.itertuples(index=False) if isinstance(records, pd.DataFrame) else records
+            write_table(path / file, f"timestamp, sensor_id, {column}", map(_line, lines))
+    if trajectory is not None:
+        trajectory.write(path / "trajectories.txt")
+    if ground_truth is not None:
+        ground_truth.write(path / ALIGNED)
+    for file, columns, signals in (("wifi.txt", _WIFI, wifi), ("bt.txt", _BLUETOOTH, bt)):
+        if signals is not None:
+            write_table(path / file, f"timestamp, sensor_id, {columns}", map(_line, signals))
+    # The benchmark's evaluation expects the files in proc/ without a header.
+    if subsessions is not None:
+        write_table(path / "proc" / "subsessions.txt", None, (_line([name]) for name in subsessions))
+    for name, table in (keyframes or {}).items():
+        file = f"keyframes_{name.removeprefix('keyframes_')}.txt"
+        write_table(path / "proc" / file, None, map(_line, zip(times_of(table), table["device_id"], strict=True)))
+    return path
+
+
+def _line(values: Sequence[Any]) -> str:
+    # repr of a float is the shortest text that reads back as the same number.
+    texts = [repr(float(value)) if isinstance(value, float) else str(value) for value in values]
+    for text in texts:
+        if any(sign in text for sign in ",\n\r") or text != text.strip(" \t\r\v\f"):
+            raise ValueError(f"The capture format cannot hold a comma, a line break or spaces at an end: {text!r}.")
+    if texts[0].startswith("#"):
+        raise ValueError(f"A line of the capture format that starts with # is a comment: {texts[0]!r}.")
+    return ", ".join(texts)
+
+
+def read_depth(path: str | Path) -> NDArray[np.float32]:
+    """Return a depth map, (H, W) float32 meters along the camera's z axis, 0 where unknown.
+
+    The largest number, 65535, means unknown, too, as in 7-Scenes. Raise CaptureError if the file cannot be read or is
+    not a 16-bit image.
+    """
+    import cv2
+
+    from toolkit.capture.images import decode
+
+    try:
+        depth = decode(path, cv2.IMREAD_UNCHANGED)
+        if depth.dtype != np.uint16 or depth.ndim != 2:
+            raise ImageError(f"{depth.dtype} {depth.shape}")
+    except ImageError as error:
+        fault = f"no such file, or not a 16-bit image of one channel ({error})"
+        raise CaptureError(f"Depth map {path}: {fault}. Expected a 16-bit PNG in millimeters.") from None
+    depth[depth == UNKNOWN_DEPTH] = 0
+    return (depth / np.float32(DEPTH_SCALE)).astype(np.float32)
+
+
+def write_depth(path: str | Path, depth_m: ArrayLike) -> None:
+    """Write a depth map (H, W), meters, as a 16-bit PNG in millimeters; depth beyond 65.5 m becomes 0, unknown."""
+    import cv2
+
+    millimeters = np.round(np.asarray(depth_m, np.float64) * DEPTH_SCALE)
+    in_range = (millimeters >= 0) & (millimeters < UNKNOWN_DEPTH)  # False for NaN
+    done, png = cv2.imencode(".png", np.where(in_range, millimeters, 0).astype(np.uint16))
+    if not done:
+        raise CaptureError(f"Depth map of shape {millimeters.shape} cannot be written to {path}; expected (H, W).")
+    with write_atomic(path) as temporary:
+        temporary.write_bytes(png.tobytes())

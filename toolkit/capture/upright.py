@@ -12,14 +12,12 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from toolkit.capture.folder import Capture
-from toolkit.capture.session import Rows, Session
+from toolkit.capture.session import Capture, Rows, Session
 from toolkit.errors import CaptureError
 from toolkit.files import fingerprint
 from toolkit.geometry import Floats, Ints, unit
@@ -430,32 +428,3 @@ def _report(session: Session, roles: pd.Series, turns: Ints) -> None:
         shown = ", ".join(names[:6]) + (f", ... {len(names) - 6} more" if len(names) > 6 else "")
         parts.append(f"{texts.get(int(turn), f'turned by {90 * int(turn)} degrees counter-clockwise')}: {shown}")
     log.info("Upright: %s: %s.", session.id, "; ".join(parts) or "no images")
-
-
-def turn_image(image: NDArray[Any], k: int) -> NDArray[Any]:
-    """Return an image (H, W) or (H, W, 3) after k counter-clockwise quarter turns, contiguous; itself for k = 0."""
-    import cv2
-
-    codes = (cv2.ROTATE_90_COUNTERCLOCKWISE, cv2.ROTATE_180, cv2.ROTATE_90_CLOCKWISE)
-    image = np.ascontiguousarray(image)
-    return image if k % 4 == 0 else cv2.rotate(image, codes[k % 4 - 1])
-
-
-def turn_points(xy: ArrayLike, width: int, height: int, k: int) -> Floats:
-    """Return the pixel positions (N, 2) after k quarter turns of an image of this size, (N, 2).
-
-    The center of the top-left pixel is (0.5, 0.5), before and after.
-    """
-    x, y = np.moveaxis(np.asarray(xy, np.float64), -1, 0)
-    turned = [(x, y), (y, width - x), (width - x, height - y), (height - y, x)][k % 4]
-    return np.stack(turned, axis=-1)
-
-
-def turned_from_cam(k: ArrayLike) -> Floats:
-    """Return turned_from_cam, (..., 4, 4), of k quarter turns (...): from the camera's coordinates to the turned one's.
-
-    The pose of a turned image is world_from_cam @ invert(turned_from_cam(k)).
-    """
-    quarter = np.eye(4)
-    quarter[:2, :2] = [[0, 1], [-1, 0]]  # right becomes up (-y)
-    return np.stack([np.linalg.matrix_power(quarter, turn) for turn in range(4)])[np.asarray(k) % 4]

@@ -8,7 +8,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from toolkit.embedders.stored import (
+from toolkit.embedders.search import (
     MANIFEST_COLUMNS,
     StoredVectors,
     Vectors,

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from toolkit.capture.cameras import parse_camera
+from toolkit.capture.images import parse_camera
 from toolkit.capture.tables import FARTHEST_M
 from toolkit.errors import CaptureError
 from toolkit.geometry import Floats, make_pose

@@ -26,13 +26,12 @@ import PIL.Image
 import pycolmap
 
 from toolkit.capture import RAW_DATA, Session, Trajectory, parse_camera, write_session
-from toolkit.capture.cameras import camera_text, invertible_share
-from toolkit.capture.devices import SPLITS
-from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.images import (
     NO_FILE,
     ORIENTATION,
+    camera_text,
     find_mask,
+    invertible_share,
     is_file,
     read_header,
     read_number,
@@ -40,10 +39,10 @@ from toolkit.capture.images import (
     time_taken,
     zone_of,
 )
-from toolkit.capture.names import EXPECTED_NAME, has_long_part, is_bad_name, is_linked_here, note_linked_here
-from toolkit.capture.tables import COLUMNS, write_table
+from toolkit.capture.names import EXPECTED_NAME, SPLITS, has_long_part, is_bad_name, is_linked_here, note_linked_here
+from toolkit.capture.session import IMPORT_RECORD
+from toolkit.capture.tables import COLUMNS, read_depth, write_depth, write_table
 from toolkit.capture.upright import up_of_cameras
-from toolkit.capture.writing import read_depth, write_depth
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.georeference import alignment, gps_position, quarter_turns, read_positions
 from toolkit.exchange.import_report import ImportReport, cameras_of, grouped
@@ -59,7 +58,7 @@ from toolkit.exchange.recordings import (
 )
 from toolkit.files import IMPORTED, MASKS, own_name, read_json, recover_folder, write_atomic, write_folder, write_text
 from toolkit.geometry import Floats, make_pose, scaled
-from toolkit.manifest import nearest
+from toolkit.manifest import require_known
 
 SUBSESSION = "import"
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -653,10 +652,8 @@ def start(capture: str | Path, device: str, split: str, folder: Path, **options:
     draft = Draft(_session(Path(capture), device, split, may_exist), folder, **options)
     if draft.add and (draft.replace or draft.gps):
         raise ManifestError(f"add: found together with {'replace' if draft.replace else 'gps'}. Give one of them.")
-    if draft.placing not in PLACING:
-        raise ManifestError(f"images: unknown choice {draft.placing!r}. {nearest(draft.placing, PLACING)}")
-    if draft.axes not in AXES:
-        raise ManifestError(f"axes: unknown {draft.axes!r}. {nearest(draft.axes, AXES)}")
+    require_known("images", draft.placing, PLACING)
+    require_known("axes", draft.axes, AXES)
     if draft.unit_m is not None and not 0 < draft.unit_m < np.inf:
         raise ManifestError(f"unit: found {draft.unit_m:g}, expected the meters per unit of the poses, such as 0.01.")
     if not 0 < draft.depth_unit_mm < np.inf:
@@ -672,8 +669,7 @@ def start(capture: str | Path, device: str, split: str, folder: Path, **options:
 
 def _session(capture: Path, device: str, split: str, may_exist: bool) -> Path:
     """Return the folder of a session. Raise CaptureError if it must not exist, ManifestError if its name is invalid."""
-    if split not in SPLITS:
-        raise ManifestError(f"split: unknown {split!r}. {nearest(split, SPLITS)}")
+    require_known("split", split, SPLITS)
     if not re.fullmatch(r"[a-z0-9-]+", device):  # the rule for `extra_devices` in a manifest
         raise ManifestError(f"device: found {device!r}, expected lower-case letters, digits and '-', such as drone.")
     session = capture / "sessions" / f"{device}_{split}"

@@ -1,34 +1,58 @@
-"""Export for other tools: a COLMAP model of the map; retrieval, poses and intrinsics as hloc lists; a table of poses.
+"""Export for other tools: a COLMAP model of the map; retrieval, poses and intrinsics as hloc lists; a table of poses;
+local features and matches in the HDF5 files of hloc (https://github.com/cvg/Hierarchical-Localization), which are also
+imported; results on the Earth: tables for maps and GIS, and position and direction in the EXIF tags of the pictures.
 
 `names="own"` gives images the names that the user knows (`files.own_name`): an imported image has its path in the
 folder it was imported from, other images have their path relative to the capture's folder `sessions`. With
-`names="capture"` all paths are relative to `sessions`, as in files of local features and matches, see `exchange.hloc`.
+`names="capture"` all paths are relative to `sessions`, as in files of local features and matches.
 
 The run records where its captures are; `capture` is the new folder of one that has moved. All exports raise
 ManifestError for an unknown choice of names, a capture that is in neither place, or a capture with another name.
+
+A file of features of hloc has one group per image, with the image's name: `keypoints` (N, 2), `descriptors` (D, N) of
+unit length, `scores` (N,), `image_size` (2,) and, beyond hloc, `scales` (N,) of the keypoints. The center of the
+top-left pixel is at 0, and an attribute of the file says so; in `LocalFeatures` it is at 0.5.
+
+A file of matches has one group per pair of images, `<image>/<image>` with `/` in the names replaced by `-`: `matches0`
+(N,), for each feature of the first image the index of the matching feature of the second image or -1, and
+`matching_scores0` (N,).
+
+On the Earth are only maps with an origin, see `georeference.origin_of`. Altitudes are those of the GPS that placed the
+map.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+import json
+import logging
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import Any
 
+import h5py
 import numpy as np
 import pandas as pd
+import PIL.Image
 import pycolmap
 from numpy.typing import NDArray
 
 from toolkit.capture import Session, Trajectory
-from toolkit.capture.cameras import camera_text
+from toolkit.capture.images import HEADER_ERRORS, camera_text
 from toolkit.capture.tables import POSE_NAMES
-from toolkit.errors import COMMAND, ArtifactError, ManifestError
+from toolkit.errors import COMMAND, ArtifactError, CaptureError, DamagedError, ImageError, ManifestError, first_line
+from toolkit.exchange.georeference import GEO_COLUMNS, geographic_poses, origin_of
 from toolkit.exchange.submission import open_captures
-from toolkit.features.stores import FeatureStore
+from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures
+from toolkit.features.matching import PairMatches
+from toolkit.features.stores import FeatureStore, MatchStore, features_path, match_name, write_features, write_matches
 from toolkit.files import (
     SceneFiles,
+    files_fingerprint,
     image_name,
     own_name,
     pair_name,
     read_references,
+    read_sidecar,
     require_current,
     require_whole,
     write_atomic,
@@ -36,14 +60,24 @@ from toolkit.files import (
     write_text,
 )
 from toolkit.geometry import Floats, invert, pose_from_qt, qt_from_pose
-from toolkit.manifest import nearest
-from toolkit.mapping.local_map import LocalMap
-from toolkit.results.opening import map_inputs
-from toolkit.results.pair import PairResults, names_of_maps
+from toolkit.manifest import require_known
+from toolkit.mapping.local_map import LocalMap, map_path
+from toolkit.pose.base import Status, statuses
+from toolkit.results.pair import PairResults, localized_scenes, map_inputs, names_of_maps, pairs_of
+from toolkit.store.hdf5 import HDF5_ERRORS, group_names_of, has_group, read_group, write_groups
+from toolkit.store.items import Items
 
+log = logging.getLogger(__name__)
 NAMES = ("own", "capture", "file")
 _LOCALIZE = f"Run the localize stage first ({COMMAND} run MANIFEST --only localize)."
 Keypoints = Mapping[str, NDArray[np.floating]]
+PIXEL_CENTER = "top_left_pixel_center"
+"""Attribute of a file of features: the coordinate of the center of the top-left pixel."""
+_HALF_PIXEL = np.float32(0.5)
+KEYS = ("scene", "map_device", "query_device", "image", "timestamp", "device_id", "status")
+FORMATS = (".csv", ".geojson")
+_GPS, _EXIF_HEAD, _LONGEST_SEGMENT = 0x8825, b"Exif\0\0", 0xFFFF - 2
+_DENOMINATOR = 10**6  # of the seconds of arc: 0.03 mm
 
 
 def export_colmap(
@@ -61,7 +95,7 @@ def export_colmap(
             other images or features than those that are there.
         ManifestError: the folder `out` contains files.
     """
-    _require_names(names)
+    require_known("names", names, NAMES)
     files, session_id, out = SceneFiles(Path(run), scene), f"{device}_map", Path(out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ManifestError(f"{out}: contains files already. Give an empty or new folder.")
@@ -205,7 +239,7 @@ def export_pairs(
     is of older vectors, a line of it is malformed, a name contains a space, or a query and a reference have the same
     name.
     """
-    _require_names(names)
+    require_known("names", names, NAMES)
     path = SceneFiles(Path(run), scene).retrieval(map_device, query_device)
     require_current(path, "retrieve", missing=False)
     pairs = []
@@ -233,7 +267,7 @@ def export_poses(
     number of lines. Raise ArtifactError if the run has no such poses, they are of older references or of an older map,
     or a name contains a space.
     """
-    _require_names(names)
+    require_known("names", names, NAMES)
     path = _require_poses(SceneFiles(Path(run), scene).poses_txt(map_device, query_device))
     session, poses = session_of_run(run, scene, f"{query_device}_query", capture), Trajectory.read(path)
     lines = []
@@ -253,7 +287,7 @@ def export_intrinsics(
 
     Queries without a pose are included. Returns and errors are those of `export_poses`.
     """
-    _require_names(names)
+    require_known("names", names, NAMES)
     path = _require_poses(SceneFiles(Path(run), scene).poses_csv(map_device, query_device))
     session = session_of_run(run, scene, f"{query_device}_query", capture)
     rows = [row for rows in session.rows_of_keyframes(PairResults.open(path).table) for row in rows]
@@ -266,11 +300,6 @@ def _write_list(out: str | Path, rows: Iterable[tuple[str, ...]]) -> int:
     lines = [f"{' '.join(row)}\n" for row in rows]
     write_text(out, "".join(lines))
     return len(lines)
-
-
-def _require_names(names: str) -> None:
-    if names not in NAMES:
-        raise ManifestError(f"names: unknown {names!r}. {nearest(names, NAMES)}")
 
 
 def _exported(name: str, names: str) -> str:
@@ -299,3 +328,338 @@ def session_of_run(run: str | Path, scene: str, session_id: str, capture: str | 
     """Return a session of a run's capture, which may have moved to `capture`."""
     with open_captures([Path(run)], [] if capture is None else [capture], [scene]) as capture_of:
         return capture_of(scene)[session_id]
+
+
+# Features and matches of hloc
+
+
+def export_features(run: str | Path, scene: str, session: str, out: str | Path, kind: str = "sift") -> int:
+    """Write the features of a session, such as `ios_map`, as a file of hloc, and return the number of images.
+
+    Raise ArtifactError if the run has no such features, or several.
+    """
+    store = FeatureStore.open(only_features(SceneFiles(Path(run), scene), session, kind))
+    write_groups(Path(out), ((name, _to_hloc(store[name])) for name in store), {PIXEL_CENTER: 0.0})
+    return len(store)
+
+
+def _to_hloc(features: LocalFeatures) -> dict[str, NDArray[Any]]:
+    descriptors = features.descriptors
+    if descriptors.dtype == np.uint8:  # without loss: a byte over a power of two has 8 significant bits, float16 has 11
+        descriptors = (descriptors / np.float32(DESCRIPTOR_SCALE)).astype(np.float16)
+    return {
+        "keypoints": features.keypoints - _HALF_PIXEL,
+        "scales": features.scales,
+        "scores": features.scores,
+        "descriptors": np.ascontiguousarray(descriptors.T),
+        "image_size": np.array(features.image_size, np.int64),
+    }
+
+
+def import_features(path: str | Path, out: str | Path) -> FeatureStore:
+    """Copy a file of features, by hloc or `export_features`, to a folder, and return its content.
+
+    Raise ArtifactError if the file is missing, torn, or has no features in the layout of hloc.
+    """
+    path, made_from = Path(path), files_fingerprint([Path(path)])
+    with _opened(path) as file, Items(out, {"name": "hloc"}) as items:
+        offset = _HALF_PIXEL - np.float32(file.attrs.get(PIXEL_CENTER, 0.0))
+        names = group_names_of(file, "keypoints")
+        if not names:
+            raise ArtifactError(f"{path} holds no local features; expected a group with `keypoints` for each image.")
+        for name in names:
+            try:
+                features = _from_hloc(read_group(file, name), offset)
+            except HDF5_ERRORS as error:
+                why = f"{path}: {name} is not in the layout of hloc ({first_line(error)})."
+                raise DamagedError(path, why) from None
+            write_features(items, name, made_from, features)
+    return FeatureStore.open(out)
+
+
+def _from_hloc(arrays: Mapping[str, NDArray[Any]], offset: np.float32) -> LocalFeatures:
+    """Return the features of an image; files of hloc may lack scores, and lack scales. Raise ValueError or KeyError."""
+    keypoints = arrays["keypoints"].astype(np.float32, copy=False) + offset
+    descriptors, (width, height) = arrays["descriptors"], arrays["image_size"].tolist()
+    ones = np.ones(len(keypoints), np.float32)
+    scales, scores = arrays.get("scales", ones), arrays.get("scores", ones)
+    shapes = [keypoints.shape, scales.shape, scores.shape, descriptors.shape]
+    count = shapes[0][0] if keypoints.ndim == 2 else 0
+    if shapes != [(count, 2), (count,), (count,), (*descriptors.shape[:1], count)] or descriptors.dtype.kind != "f":
+        raise ValueError(f"keypoints, scales, scores and {descriptors.dtype} descriptors have the shapes {shapes}")
+    scales, scores = (array.astype(np.float32, copy=False) for array in (scales, scores))
+    return LocalFeatures(keypoints, scales, scores, np.ascontiguousarray(descriptors.T), (int(width), int(height)))
+
+
+def export_matches(
+    run: str | Path, scene: str, session0: str, session1: str, out: str | Path, kind: str = "sift",
+    capture: str | Path | None = None,
+) -> int:  # fmt: skip
+    """Write the matches of two sessions as a file of hloc, and return the number of pairs.
+
+    Sessions are such as `ios_query` and `ios_map`; twice the same for the pairs of a map, whose `capture` may have
+    moved. Raise ArtifactError if the run has no such matches, those of several settings or of older features, or pairs
+    that hloc cannot tell apart.
+    """
+    files = SceneFiles(Path(run), scene)
+    folder = files.maps / f"{session0}-{session1}"
+    tiles = [Items(path) for path in sorted(folder.glob(f"{kind}-*")) if path.is_dir()]  # a large map has several
+    made_by = [{key: value for key, value in tile.made_by.items() if key != "tile"} for tile in tiles if tile]
+    if not made_by or any(other != made_by[0] for other in made_by):
+        found = f"found matches of {kind} of {len(made_by)} settings, expected one"
+        raise ArtifactError(f"{folder}: {found}. Delete this folder and run the localize stage again.")
+    paths = zip((session0, session1), made_by[0]["features"], strict=True)
+    first, second = (FeatureStore.open(features_path(files.features, *of_session)) for of_session in paths)
+    of_map, path = session0 == session1, map_path(files.maps, session0, kind)
+    if of_map and (read_sidecar(path) or {}).get("inputs"):
+        require_current(path, "localize", inputs=map_inputs(session_of_run(run, scene, session0, capture), first))
+    groups: dict[str, tuple[str, str]] = {}
+    older: list[tuple[str, str]] = []
+
+    def written() -> Iterator[tuple[str, dict[str, NDArray[Any]]]]:
+        for tile in tiles:
+            matches = MatchStore(tile.folder, tile)
+            for item in tile:
+                name0, _, name1 = item.partition("\n")
+                names = name0, name1
+                if not of_map and tile.source(item) != first.made_from.get(name0, "") + second.made_from.get(name1, ""):
+                    older.append(names)
+                    continue
+                if names != groups.setdefault(_group(*names), names):
+                    other = groups[_group(*names)]
+                    raise ArtifactError(f"{folder}: hloc cannot tell the pairs {names} and {other} apart. Rename one.")
+                yield _group(*names), _matches_to_hloc(matches[names], len(first[names[0]]))
+
+    write_groups(Path(out), written(), {})
+    if older:
+        log.warning("%s: %d pairs of older features are left out. Run the localize stage again.", folder, len(older))
+    return len(groups)
+
+
+def _matches_to_hloc(matches: PairMatches, count: int) -> dict[str, NDArray[Any]]:
+    # 16 bits as in hloc; few networks find more features.
+    matches0 = np.full(count, -1, np.int16 if matches.indices.max(initial=0) <= np.iinfo(np.int16).max else np.int32)
+    scores = np.zeros(count, np.float16)
+    matches0[matches.indices[:, 0]] = matches.indices[:, 1]
+    scores[matches.indices[:, 0]] = matches.scores
+    return {"matches0": matches0, "matching_scores0": scores}
+
+
+def import_matches(path: str | Path, pairs: Iterable[tuple[str, str]], out: str | Path) -> MatchStore:
+    """Copy matches of pairs of images, by name in either order, from a file of hloc to a folder; return its content.
+
+    Raise ArtifactError if the file is missing, torn or of another layout, or lacks a pair.
+    """
+    path, made_from = Path(path), files_fingerprint([Path(path)])
+    with _opened(path) as file, Items(out, {"name": "hloc"}) as items:
+        for names in pairs:
+            step = next((step for step in (1, -1) if has_group(file, _group(*names[::step]))), 0)
+            if not step:
+                raise ArtifactError(f"{path}: has no matches of {names[0]} and {names[1]}.")
+            arrays = read_group(file, _group(*names[::step]))
+            partners, scores = (arrays.get(key, np.zeros(())) for key in ("matches0", "matching_scores0"))
+            if partners.ndim != 1 or partners.dtype.kind not in "iu" or scores.shape != partners.shape:
+                expected = "expected matches0 (N,), whole numbers, and matching_scores0 (N,)"
+                raise DamagedError(path, f"{path}: {names} are not in the layout of hloc; {expected}.")
+            at = np.flatnonzero(partners >= 0)
+            indices = np.stack([at, partners[at].astype(np.int64)], axis=1)[:, ::step]
+            write_matches(items, match_name(*names), made_from, PairMatches(indices, scores[at].astype(np.float32)))
+    return MatchStore(out)
+
+
+def _group(name0: str, name1: str) -> str:
+    return f"{name0.replace('/', '-')}/{name1.replace('/', '-')}"
+
+
+def _opened(path: Path) -> h5py.File:
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        raise ArtifactError(f"{path} cannot be read as HDF5 ({first_line(error)}).") from None
+
+
+# Results on the Earth
+
+
+def geo_table(run: str | Path, capture: str | Path | None = None) -> pd.DataFrame:
+    """Return a row per query image of a run and map with an origin: `KEYS`, `georeference.GEO_COLUMNS`, `num_inliers`,
+    `position_std_m` and `path`, the file. The columns of the pose are NaN without a pose. `capture` is its folder, if
+    it has moved since the run.
+
+    Raises:
+        CaptureError: no map has an origin.
+        ArtifactError: there are no poses, or they are of older references or of an older map.
+    """
+    run, tables, refused = Path(run), list[pd.DataFrame](), list[CaptureError]()
+    scenes = localized_scenes(run)
+    with open_captures([run], [] if capture is None else [capture], scenes) as capture_of:
+        for scene in scenes:
+            for path in pairs_of(SceneFiles(run, scene).poses_dir):
+                results = PairResults.open(path)
+                results.require_current()
+                map_device, query_device = results.devices
+                try:
+                    origin = origin_of(capture_of(scene)[f"{map_device}_map"])
+                except CaptureError as error:
+                    refused.append(error)
+                    continue
+                tables.append(_table_of(results, capture_of(scene)[f"{query_device}_query"], origin, scene))
+    if not tables:
+        raise refused[0] if refused else ArtifactError(f"{run}: no query was localized. Run the localize stage first.")
+    return pd.concat(tables, ignore_index=True)
+
+
+def _table_of(results: PairResults, session: Any, origin: Floats, scene: str) -> pd.DataFrame:
+    numbers, rows = [], []
+    for number, of_query in enumerate(session.rows_of_keyframes(results.table)):
+        numbers += [number] * len(of_query)
+        rows += of_query.tolist()
+    table = results.table.iloc[numbers].reset_index(drop=True)
+    world_from_cams = results.poses[numbers] @ session.rig_from_cam(rows)
+    table = table.assign(
+        scene=scene, map_device=results.devices[0], query_device=results.devices[1],
+        image=[session.image_name(row) for row in rows], path=[session.image_path(row) for row in rows],
+    )  # fmt: skip
+    table[list(GEO_COLUMNS)] = geographic_poses(world_from_cams, origin)
+    return table.reindex(columns=[*KEYS, *GEO_COLUMNS, "num_inliers", "position_std_m", "path"])
+
+
+def export_geo(run: str | Path, out: str | Path, capture: str | Path | None = None) -> int:
+    """Write `geo_table` as CSV, or as GeoJSON (RFC 7946), where images without a pose have no geometry.
+
+    Return the number of images with a pose.
+
+    Raises:
+        ManifestError: the file's name ends neither in .csv nor in .geojson; and as for `geo_table`.
+    """
+    out = Path(out)
+    if out.suffix.lower() not in FORMATS:
+        raise ManifestError(f"{out}: found the ending {out.suffix!r}, expected {' or '.join(FORMATS)}.")
+    table = geo_table(run, capture).drop(columns="path").assign(image=lambda rows: rows["image"].map(own_name))
+    if out.suffix.lower() == ".csv":
+        with write_atomic(out) as temporary:
+            table.to_csv(temporary, index=False)
+        return int(table["latitude_deg"].notna().sum())
+    features = []
+    for row in json.loads(table.to_json(orient="records", double_precision=15)):  # NaN becomes null
+        latitude, longitude, altitude = (row[name] for name in GEO_COLUMNS[:3])
+        point = {"type": "Point", "coordinates": [longitude, latitude, altitude]} if latitude is not None else None
+        features.append({"type": "Feature", "geometry": point, "properties": row})
+    write_text(out, json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n")
+    return sum(feature["geometry"] is not None for feature in features)
+
+
+def export_exif(
+    run: str | Path, out: str | Path, capture: str | Path | None = None, unsure: bool = False, xmp: bool = False
+) -> int:  # fmt: skip
+    """Write copies of the query pictures with position and direction in EXIF; the pixels of JPEGs stay byte for byte.
+
+    With `xmp`, write XMP files with these tags instead, `a.xmp` of `a.jpg`, to lie beside the pictures. Of a picture
+    that was localized in several maps, the pose with the most inliers, then the surest, is taken; with `unsure`, also
+    one of low confidence. Times and other tags stay. Return the number of pictures.
+
+    Raises:
+        ManifestError: the folder `out` contains files; or two XMP files would have one name.
+        ImageError: a picture cannot be read; and as for `geo_table`.
+    """
+    out = Path(out)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ManifestError(f"{out}: contains files already. Give an empty or new folder.")
+    table = geo_table(run, capture)
+    table = table.assign(sure=statuses(table["status"]) == str(Status.OK))
+    table = table[table["latitude_deg"].notna() & (table["sure"] | unsure)]
+    best_first = ["sure", "num_inliers", "position_std_m"]
+    table = table.sort_values(best_first, ascending=[False, False, True], kind="stable")
+    table = table.drop_duplicates(["scene", "image"])
+    if not len(table):
+        raise ArtifactError(f"{run}: no query has a pose that is sure. Take the others by --unsure.")
+    names = table["image"].map(own_name)
+    if names.duplicated().any():  # of several sessions or scenes
+        names = table["scene"] + "/" + table["image"].map(image_name)
+    if xmp:
+        names = names.map(lambda name: PurePosixPath(name).with_suffix(".xmp").as_posix())
+        if names.duplicated().any():
+            raise ManifestError(f"xmp: two pictures would have the file {names[names.duplicated()].iloc[0]}.")
+    with write_folder(out) as folder:
+        for name, row in zip(names, table.to_dict("records"), strict=True):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            if xmp:
+                write_text(folder / name, _xmp(row))
+            else:
+                _write_with_gps(Path(row["path"]), folder / name, row)
+    return len(table)
+
+
+def _degrees(value: float) -> tuple[int, int, float]:
+    """Return whole degrees, whole minutes, and seconds."""
+    parts = round(abs(value) * 3600 * _DENOMINATOR)
+    minutes, seconds = divmod(parts, 60 * _DENOMINATOR)
+    return *divmod(minutes, 60), seconds / _DENOMINATOR
+
+
+def _write_with_gps(source: Path, target: Path, row: Mapping[Any, Any]) -> None:
+    """Write a copy of a picture with other GPS tags."""
+    try:
+        with PIL.Image.open(source) as image:
+            exif, kind, jpeg = image.getexif(), image.format, source.read_bytes()
+            tags = exif.get_ifd(_GPS)
+            latitude, longitude, altitude, heading = (row[name] for name in GEO_COLUMNS[:4])
+            tags |= {
+                0: b"\x02\x03\x00\x00", 1: "NS"[latitude < 0], 2: _degrees(latitude), 3: "EW"[longitude < 0],
+                4: _degrees(longitude), 5: b"\x01" if altitude < 0 else b"\x00", 6: round(abs(altitude), 3),
+                18: "WGS-84",
+            }  # fmt: skip
+            for tag in (16, 17, 31):
+                tags.pop(tag, None)
+            if math.isfinite(heading):
+                tags |= {16: "T", 17: round(heading, 2) % 360}
+            if math.isfinite(row["position_std_m"]):
+                tags[31] = round(row["position_std_m"], 4)
+            exif[_GPS] = tags
+            if not jpeg.startswith(b"\xff\xd8"):  # of a JPEG with several pictures, Pillow says MPO
+                image.save(target, format=kind, exif=exif, icc_profile=image.info.get("icc_profile"))
+                return
+        content = _EXIF_HEAD + exif.tobytes().removeprefix(_EXIF_HEAD)
+        target.write_bytes(_with_exif(jpeg, content))
+    except HEADER_ERRORS as error:
+        raise ImageError(f"{source}: EXIF tags cannot be written ({error}).") from None
+
+
+def _xmp(row: Mapping[Any, Any]) -> str:
+    """Return XMP with the tags of position and direction (XMP Specification, part 2, "Exif schema")."""
+    latitude, longitude, altitude, heading = (row[name] for name in GEO_COLUMNS[:4])
+
+    def angle(value: float, letters: str) -> str:
+        degrees, minutes = divmod(round(abs(value) * 60, 8), 60)
+        return f"{degrees:.0f},{minutes:.8f}{letters[value < 0]}"
+
+    tags = {
+        "GPSVersionID": "2.3.0.0", "GPSLatitude": angle(latitude, "NS"), "GPSLongitude": angle(longitude, "EW"),
+        "GPSAltitudeRef": int(altitude < 0), "GPSAltitude": f"{round(abs(altitude) * 1000)}/1000",
+        "GPSMapDatum": "WGS-84",
+    }  # fmt: skip
+    if math.isfinite(heading):
+        tags |= {"GPSImgDirectionRef": "T", "GPSImgDirection": f"{round(heading * 100) % 36000}/100"}
+    if math.isfinite(row["position_std_m"]):
+        tags["GPSHPositioningError"] = f"{round(row['position_std_m'] * 10000)}/10000"
+    lines = "".join(f'\n   exif:{name}="{value}"' for name, value in tags.items())
+    return (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/">\n <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">\n'
+        f'  <rdf:Description rdf:about="" xmlns:exif="http://ns.adobe.com/exif/1.0/"{lines}/>\n'
+        " </rdf:RDF>\n</x:xmpmeta>\n"
+    )
+
+
+def _with_exif(jpeg: bytes, exif: bytes) -> bytes:
+    """Return a JPEG with this EXIF segment in place of its own (Exif 2.3, 4.5.4)."""
+    if len(exif) > _LONGEST_SEGMENT:
+        raise ValueError(f"{len(exif)} bytes of EXIF tags, at most {_LONGEST_SEGMENT} fit")
+    kept, at = bytearray(), 2
+    while jpeg[at : at + 1] == b"\xff" and jpeg[at + 1] != 0xDA:  # up to the start of the scan
+        end = at + 2 + int.from_bytes(jpeg[at + 2 : at + 4], "big")
+        if not (jpeg[at + 1] == 0xE1 and jpeg[at + 4 : at + 10] == _EXIF_HEAD):
+            kept += jpeg[at:end]
+        at = end
+    if jpeg[at : at + 2] != b"\xff\xda":
+        raise ValueError("no start of a scan")
+    return jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + bytes(kept) + jpeg[at:]

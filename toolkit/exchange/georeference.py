@@ -11,8 +11,8 @@ import pycolmap
 
 from toolkit.alignment.similarity import align_to_map
 from toolkit.capture import Session
-from toolkit.capture.folder import IMPORT_RECORD
 from toolkit.capture.images import HEADER_ERRORS, ORIENTATION, read_number
+from toolkit.capture.session import IMPORT_RECORD
 from toolkit.capture.upright import up_of_cameras
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.recordings import numbers_in, read_csv

@@ -20,13 +20,13 @@ import pandas as pd
 
 from toolkit.capture import COLUMNS, Capture, Trajectory
 from toolkit.capture.check import UNIT_TOLERANCE
-from toolkit.capture.devices import SPLITS, extra_devices
-from toolkit.capture.names import allow_outside
+from toolkit.capture.names import SPLITS, allow_outside, extra_devices
 from toolkit.capture.tables import read_table
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
 from toolkit.files import SceneFiles, pair_name, read_references, require_current, write_atomic
 from toolkit.geometry import Floats, invert, qt_from_pose, unit
-from toolkit.pose.result import Status
+from toolkit.manifest import require_known
+from toolkit.pose.base import Status
 from toolkit.results.pair import PairResults
 
 FAILED = ("nearest", "leave-out")
@@ -98,8 +98,7 @@ def collect(
             queries, or a poses file has a duplicate key or a quaternion that is not of unit length.
         CaptureError: a malformed poses file, or no such keyframe list; names file and line.
     """
-    if failed not in FAILED:
-        raise ManifestError(f"failed: unknown choice {failed!r}. Known: {', '.join(FAILED)}.")
+    require_known("failed", failed, FAILED)
     folders = [Path(run) for run in runs]
     if absent := [folder for folder in folders if not folder.is_dir()]:
         raise ManifestError(f"{absent[0]}: no such run folder. Expected <output_root>/<manifest name>.")

@@ -1,7 +1,8 @@
 """Local features of a session's images, and matches of two sessions' images, in folders of items.
 
 Each session has one folder of features per kind and settings, with an item per image, by the image's name. Two sessions
-have one folder of matches per kind and settings, with an item per pair of images. For hloc's files see `exchange.hloc`.
+have one folder of matches per kind and settings, with an item per pair of images. For hloc's files see
+`exchange.export`.
 """
 
 import logging
@@ -18,12 +19,10 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Session
-from toolkit.capture.cameras import camera_text, sees_all
-from toolkit.capture.images import default_workers, prefetch, read_image
+from toolkit.capture.images import camera_text, default_workers, prefetch, read_image, sees_all
 from toolkit.errors import ArtifactError, ImageError
-from toolkit.features.features import KINDS, Extractor, LocalFeatures, extract_turned, usable
+from toolkit.features.features import KINDS, Extractor, LocalFeatures, SiftExtractor, extract_turned, usable
 from toolkit.features.matching import Matcher, PairMatches
-from toolkit.features.sift import SiftExtractor
 from toolkit.files import files_fingerprint, fingerprint, link_folder
 from toolkit.geometry import Ints
 from toolkit.store.items import Items

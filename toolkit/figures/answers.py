@@ -33,9 +33,8 @@ from toolkit.figures.top_view import Ground, Layer, Places, draw_layers, window_
 from toolkit.geometry import Floats, shifted
 from toolkit.manifest import LocalizeSettings
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.base import View
-from toolkit.pose.confidence import bounded_by_rivals
-from toolkit.pose.result import CAMERA, QueryResult, Status
+from toolkit.pose.base import CAMERA, QueryResult, Status, View
+from toolkit.pose.pnp import bounded_by_rivals
 from toolkit.results.localized import QueryDetails, is_predicted, query_details, sure_points
 from toolkit.results.metrics import is_posed, pose_errors
 

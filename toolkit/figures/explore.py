@@ -9,7 +9,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture import Capture, Session
-from toolkit.capture.devices import color_of
+from toolkit.capture.names import color_of
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.embedders import embedding_folders, open_descriptors
 from toolkit.errors import CaptureError
@@ -18,7 +18,7 @@ from toolkit.figures.style import GREEN, ORANGE, VERMILLION, new_figure, plain_l
 from toolkit.figures.top_view import Ground, Layer, draw_places
 from toolkit.files import image_name, pair_devices, read_references
 from toolkit.geometry import Floats, qt_from_pose, unit
-from toolkit.pose.result import statuses
+from toolkit.pose.base import statuses
 from toolkit.results.metrics import is_posed
 from toolkit.results.pair import PairResults
 from toolkit.sequences.odometry import Odometry, recordings_of

@@ -1,7 +1,15 @@
 """The manifest (what to run) and the tree of settings that all stages share."""
 
-from toolkit.manifest.loading import find_manifest, load_manifest
-from toolkit.manifest.manifest import OPTIONAL, STAGES, DatasetSettings, DemoData, Manifest, Source
+from toolkit.manifest.manifest import (
+    OPTIONAL,
+    STAGES,
+    DatasetSettings,
+    DemoData,
+    Manifest,
+    Source,
+    find_manifest,
+    load_manifest,
+)
 from toolkit.manifest.settings import (
     AUTO,
     AlikedModel,
@@ -27,4 +35,5 @@ from toolkit.manifest.settings import (
     checkpoint_of,
     describe,
     nearest,
+    require_known,
 )

@@ -20,6 +20,12 @@ _BRANCH = r"literal|int$|str$|list\[|dict\[|constrained"
 """Names that pydantic adds to the path of a key whose value may have several types."""
 
 
+def require_known(what: str, value: str, known: Iterable[str]) -> None:
+    """Raise ManifestError, which names the nearest of the known values, for an unknown value of an option."""
+    if value not in (known := [*known]):
+        raise ManifestError(f"{what}: unknown {value!r}. {nearest(value, known)}")
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return a sentence that suggests the known name nearest to `name`, and lists all known names."""
     known = sorted(known)
@@ -318,7 +324,7 @@ class RetrieveSettings(Settings):
 class SiftSettings(Settings):
     """SIFT keypoints and descriptors."""
 
-    constants = {"features/sift.py": "contrast_threshold"}
+    constants = {"features/features.py": "contrast_threshold"}
     min_long_side: Natural = 640
     """Before detection, smaller images are enlarged to this length of the longer side, pixels."""
     max_long_side: Positive = 1280
@@ -412,7 +418,7 @@ class MatcherSettings(Settings):
 class RerankSettings(Settings):
     """Reranking: sorts retrieved images by their number of geometrically verified matches with the query image."""
 
-    constants = {"features/verification.py": "max_error_deg max_trials"}
+    constants = {"features/matching.py": "max_error_deg max_trials"}
     topn: Positive = 30
     """Retrieved images per query image to verify. It is also the number to retrieve, unless `retrieve.topk` is set."""
     topk: Positive = 10
@@ -507,7 +513,7 @@ class PnpSettings(Settings):
     query has no pose."""
     ok_probability: Share = 0.99
     """A pose is `ok` only if the estimated probability that it is right (within 5 degrees and 0.5 m) reaches this
-    value; see `pose/confidence.py`."""
+    value; see `pose/pnp.py`."""
 
 
 class PredictorSettings(Settings):

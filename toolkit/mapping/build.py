@@ -15,8 +15,7 @@ from tqdm.auto import tqdm
 
 from toolkit import geometry
 from toolkit.capture import Session
-from toolkit.capture.cameras import camera_text, in_view, rays_of, view_bounds
-from toolkit.capture.images import default_workers, prefetch, read_image
+from toolkit.capture.images import camera_text, default_workers, in_view, prefetch, rays_of, read_image, view_bounds
 from toolkit.errors import ArtifactError, ImageError
 from toolkit.features.features import KINDS, FeatureKind, LocalFeatures, feature_kind, shorten_settings
 from toolkit.features.matching import PairMatches, match_along_epipolar_lines, unit_descriptors
@@ -26,9 +25,15 @@ from toolkit.geometry import Floats, Ints
 from toolkit.manifest import MapSettings
 from toolkit.mapping.local_map import LocalMap
 from toolkit.mapping.pose_consistency import Survey, SurveyedImages
-from toolkit.mapping.refinement import refined_poses
-from toolkit.mapping.tiles import JoinedImages, home_of, join_tiles, plan_tiles
-from toolkit.mapping.triangulation import MAX_REPROJECTION_ERROR_PX, triangulate
+from toolkit.mapping.pose_noise import refined_poses
+from toolkit.mapping.triangulation import (
+    MAX_REPROJECTION_ERROR_PX,
+    JoinedImages,
+    home_of,
+    join_tiles,
+    plan_tiles,
+    triangulate,
+)
 from toolkit.runs.cluster import current_cluster
 from toolkit.store.items import Items
 from toolkit.threads import fixed_sums

@@ -16,7 +16,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from toolkit import geometry
-from toolkit.capture.cameras import camera_text, parse_camera, projection_jacobian
+from toolkit.capture.images import camera_text, parse_camera, projection_jacobian
 from toolkit.errors import COMMAND, ArtifactError
 from toolkit.files import require_whole, write_atomic
 from toolkit.geometry import Floats, Ints

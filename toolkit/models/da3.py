@@ -16,8 +16,18 @@ from torch import Tensor, nn
 
 from toolkit.geometry import Floats, invert, make_pose
 from toolkit.models import multiview
-from toolkit.models.dpt import ConvolutionalHead, LayerTokens, dense_output
-from toolkit.models.multiview import Fit, Loader, MultiView, Size, Source, Views, unproject_depth
+from toolkit.models.multiview import (
+    ConvolutionalHead,
+    Fit,
+    LayerTokens,
+    Loader,
+    MultiView,
+    Size,
+    Source,
+    Views,
+    dense_output,
+    unproject_depth,
+)
 from toolkit.models.vit import PATCH, Dinov2, normalized, places_of_view, rope_of_places, set_matrix_type
 from toolkit.models.weights import read_state_dict
 

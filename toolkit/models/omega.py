@@ -13,15 +13,18 @@ import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor, nn
 
-from toolkit.models.dpt import DenseHead, LayerTokens, add_position, dense_output
 from toolkit.models.multiview import (
+    DenseHead,
     Fit,
+    LayerTokens,
     Loader,
     MultiView,
     Size,
     Source,
     Views,
+    add_position,
     cameras_from_pose_encoding,
+    dense_output,
     unproject_depth,
     with_special_tokens,
 )

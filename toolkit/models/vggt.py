@@ -12,15 +12,17 @@ import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor, nn
 
-from toolkit.models.dpt import ConvolutionalHead, LayerTokens, dense_output
 from toolkit.models.multiview import (
+    ConvolutionalHead,
     Fit,
+    LayerTokens,
     Loader,
     MultiView,
     Size,
     Source,
     Views,
     cameras_from_pose_encoding,
+    dense_output,
     unproject_depth,
     with_special_tokens,
 )

@@ -1,24 +1,50 @@
-"""The interface of all localizers: a query and its references go in, its pose comes out."""
+"""A query and its references go into all localizers, its result comes out: status and reason, pose, evidence,
+references, and correspondences.
+"""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
+import pandas as pd
 import pycolmap
 from numpy.typing import NDArray
 
 from toolkit import geometry
-from toolkit.capture.cameras import camera_text
-from toolkit.capture.images import pixels_of, stored_size, thumbnails
-from toolkit.errors import CameraError
+from toolkit.capture.images import camera_text, pixels_of, stored_size, thumbnails
+from toolkit.errors import INTERNAL, ArtifactError, CameraError
 from toolkit.features.features import KINDS, LocalFeatures, extract_turned, usable
 from toolkit.features.matching import AnyMethod, PairMatches
 from toolkit.geometry import Floats, Ints
-from toolkit.pose.result import QueryResult, Status
 
+CAMERA = "camera?"
+"""Reason of a pose whose matches contradict the intrinsics of the query."""
+AGREEMENT = (5.0, 0.5)  # degrees, meters: two poses within both confirm each other
+_NAMES = ("images", "references", "rejected")
+_STORED: dict[str, tuple[type[np.generic], tuple[int, ...]]] = {
+    "camera": (np.int32, ()),
+    "pixels": (np.float32, (2,)),
+    "points": (np.float64, (3,)),
+    "point_index": (np.int32, ()),
+    "agrees": (np.bool_, ()),
+    "view_of": (np.int32, ()),
+    "view_reference": (np.int32, ()),
+    "view_pixels": (np.float32, (2,)),
+}
+"""Types of the arrays of `Correspondences` in a file, and shapes of their entries. float32 makes the file smaller and
+keeps pixels of any image exact to a hundredth."""
+_NUMBERS = {
+    "num_inliers": 0, "num_matches": 0, "inlier_ratio": 4, "num_guided": 0, "rmse_px": 4, "rival_support": 4,
+    "coverage": 4, "agreement": 0, "p_correct": 4, "position_std": 6, "rotation_std_deg": 6, "seconds": 4,
+    "scale_std": 6,
+}  # fmt: skip
+"""Numbers in the table, and the decimals that they are rounded to."""
+_FROM_OTHERS = ("inlier_ratio", "position_std", "rotation_std_deg")
+"""Numbers that follow from other attributes."""
 SEARCH_DEG = (1.0, 6.0)
 """Smallest and largest radius of the search for keypoints around the projections of a prior pose, degrees."""
 NEARBY_M = 3.0
@@ -26,6 +52,344 @@ NEARBY_M = 3.0
 angle."""
 NetworkMatches = Callable[[str], PairMatches]
 """Returns the stored network matches between a query image and the map image of a given name."""
+
+
+class Status(StrEnum):
+    """Whether a query has a pose that can be relied on."""
+
+    OK = "ok"
+    LOW_CONFIDENCE = "low_confidence"
+    FAILED = "failed"
+
+    @classmethod
+    def parse(cls, text: str) -> "tuple[Status, str]":
+        """Return status and reason from a text such as `failed: too few matches`, column `status` of the tables."""
+        status, _, reason = text.partition(": ")
+        return cls(status), reason
+
+    @property
+    def rank(self) -> int:
+        """2 for `ok`, 1 for `low_confidence`, 0 without a pose."""
+        return 2 - list(Status).index(self)
+
+
+def statuses(texts: pd.Series) -> pd.Series:
+    """Return the column `status` of a table without the reasons: `ok`, `low_confidence`, `failed`."""
+    return texts.astype(object).fillna("").astype(str).str.split(":", n=1).str[0]
+
+
+def status_counts(texts: pd.Series) -> dict[str, int]:
+    """Return how many rows of a table have each status."""
+    counts = statuses(texts).value_counts()
+    return {str(status): int(counts.get(status, 0)) for status in Status}
+
+
+class Rival(NamedTuple):
+    """A pose that clearly differs from the estimate but is supported by matches too."""
+
+    world_from_rig: Floats
+    """(4, 4)"""
+    support: float
+    """Support by its guided matches, divided by that of the estimate, see `QueryResult.rival_support`."""
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """K correspondences between a query device and the map, and M observations of their points in the references."""
+
+    camera: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(K,) index of the query image."""
+    pixels: Floats = field(default_factory=lambda: np.zeros((0, 2)))
+    """(K, 2) in the query image; the center of the top-left pixel is (0.5, 0.5)."""
+    points: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    """(K, 3) in the world, meters."""
+    point_index: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(K,) index of the map point, counted through all maps in order; -1 for a point lifted by depth."""
+    agrees: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+    """(K,) whether it agrees with the pose: guided, or within `max_error_deg`. `num_inliers` is another number."""
+    found_by: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, "U1"))
+    """(K,) `<kind of features>/<descriptors, guided or lifted>`."""
+    view_of: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(M,) index of the correspondence whose point is observed."""
+    view_reference: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(M,) index of the reference that observes it."""
+    view_pixels: Floats = field(default_factory=lambda: np.zeros((0, 2)))
+    """(M, 2) pixel of the observation in the reference."""
+
+    def __len__(self) -> int:
+        return len(self.camera)
+
+
+class Context(Protocol):
+    """A query in its map, which its results need to show themselves."""
+
+    @property
+    def answer(self) -> "Callable[[QueryResult], Any]": ...
+    def show_3d(self, results: Sequence["QueryResult"], rays: bool) -> Any: ...
+    @property
+    def what_if(self) -> Callable[..., Any]: ...
+
+
+@dataclass(frozen=True, repr=False)
+class QueryResult:
+    """How one query was localized: its pose and how far to trust it, or why it has none."""
+
+    status: Status
+    reason: str = ""
+    """Why it is not `ok`, in few words; empty for a pose with too little support."""
+    world_from_rig: Floats | None = None
+    """(4, 4). For a single camera, the rig is the camera."""
+    covariance: Floats | None = None
+    """(6, 6) of a small motion of the rig in its own frame: rotation in radians, then translation in meters."""
+    num_matches: int = 0
+    """2D-3D matches found from descriptors alone."""
+    num_inliers: int = 0
+    """Inliers: those of `num_matches` within `ransac_max_error_deg` of the final pose. Those that share a point or a
+    keypoint count once."""
+    num_guided: int = 0
+    """Guided matches within `max_error_deg`, from which the final pose is computed."""
+    rmse_px: float = float("nan")
+    rival_support: float = 0.0
+    """Support of the best clearly different pose (beyond 2.5 degrees or 0.25 m), divided by that of this pose; 0 if
+    there is none. A guided match supports a pose by 1 - (error / `max_error_deg`)^2, at least 0."""
+    rivals: tuple[Rival, ...] = ()
+    """Clearly different poses that some matches support, best supported first."""
+    coverage: float = 0.0
+    """Share of grid cells with an inlier; each query image has 16 cells."""
+    agreement: int = 0
+    """Inliers of the second best kind of features; 0 if there is one kind."""
+    p_correct: float = float("nan")
+    """Probability that the pose is within 5 degrees and 0.5 m, see `confidence`; NaN if it is not from matches."""
+    images: tuple[str, ...] = ()
+    """Names of the C query images."""
+    references: tuple[str, ...] = ()
+    """Names of the map images that support the pose, best first."""
+    correspondences: Correspondences = field(default_factory=Correspondences)
+    """Matches that agree with the pose, and those that do not."""
+    found_by: str = "pnp"
+    """Method that found the pose: `pnp`; `pnp+feed_forward` or `pnp+near` (PnP from a prior); `lifted` (map features
+    lifted by the capture's depth maps); `lifted+feed_forward` (also by predicted depth); `feed_forward` (a
+    prediction); `nearest`; `sequence`."""
+    scale_std: float = float("nan")
+    """Relative standard deviation of the scale of a prediction; inf if unknown, NaN without a prediction."""
+    rejected: tuple[str, ...] = ()
+    """Names of references whose predicted poses contradict those of the other references."""
+    remark: str = ""
+    """Intrinsics that fit the query better than the stated ones; images that cannot be read; for a prediction, what was
+    left out or is unknown. Column `reason` of the table."""
+    misfit: bool = False
+    """Whether the matches contradict the intrinsics of the query, see `misfit`. More features cannot repair that. A
+    small contradiction only widens the covariance."""
+    focals_px: tuple[float, ...] = ()
+    """Per query image, the focal length that fits, or NaN if the focal length is not the problem. Empty if the
+    intrinsics are not contradicted."""
+    centers_px: tuple[tuple[float, float], ...] = ()
+    """Per query image, the principal point that fits, or NaN; as `focals_px`."""
+    seconds: float = float("nan")
+    """Time that it took."""
+    first_status: str | None = None
+    """If fallback features were used: status and reason from the other features alone."""
+    first_seconds: float | None = None
+    """Time that the pose from the other features took."""
+    context: Context | None = field(default=None, repr=False, compare=False)
+    """The query in its map; None for a result that a `Map` or `Run` did not return."""
+
+    def show(self) -> Any:
+        """Return status and reason in words, numbers, matches, references and positions; a notebook shows a figure.
+
+        Raises:
+            ArtifactError: the result is not of a `Map` or `Run`.
+        """
+        return self._in_map.answer(self)
+
+    def show_3d(self, *others: "QueryResult", rays: bool = False) -> Any:
+        """Return this result and others in the map in 3D: cameras, uncertainty, rivals, references and map points.
+
+        In a live notebook, it is shown by the rerun viewer; a saved notebook keeps a picture.
+
+        Args:
+            others: further results in the same map.
+            rays: draw a ray from the camera through each match that agrees to its map point.
+
+        Raises:
+            ArtifactError: the result is not of a `Map` or `Run`.
+        """
+        return self._in_map.show_3d([self, *others], rays)
+
+    def what_if(self, changes: Mapping[str, Any] | None = None, **more: Any) -> Any:
+        """Localize the query again with something changed; see `scene.query.Located.what_if`."""
+        return self._in_map.what_if(self, changes or {}, **more)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle the result without its map."""
+        return {**self.__dict__, "context": None}
+
+    @property
+    def _in_map(self) -> Context:
+        if self.context is None:
+            raise ArtifactError("This result belongs to no map. To get one that does: Map.locate, or Run.result.")
+        return self.context
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(self.status_text)}</p>" if self.context is None else str(self.context.answer(self).html)
+
+    @classmethod
+    def failed(cls, reason: str, **known: Any) -> Self:
+        """Return a result without a pose."""
+        return cls(Status.FAILED, reason, **known)
+
+    @property
+    def status_text(self) -> str:
+        """Status and reason, column `status` of the table: `failed: too few matches`."""
+        return f"{self.status}: {self.reason}" if self.reason else str(self.status)
+
+    @property
+    def position_std(self) -> float:
+        """In the unit of the poses: meters, if it is known."""
+        return float("nan") if self.covariance is None else float(stds_of(self.covariance)[1])
+
+    @property
+    def rotation_std_deg(self) -> float:
+        return float("nan") if self.covariance is None else float(stds_of(self.covariance)[0])
+
+    @property
+    def inlier_ratio(self) -> float:
+        return self.num_inliers / self.num_matches if self.num_matches else 0.0
+
+    @property
+    def is_internal(self) -> bool:
+        """Whether an error of the toolkit, not of the data, is the reason. Such a query is tried again."""
+        return INTERNAL in self.reason or INTERNAL in self.remark
+
+    def __repr__(self) -> str:
+        if self.world_from_rig is None:
+            return f"QueryResult({self.status_text})"
+        position = ", ".join(f"{x:.3f}" for x in self.world_from_rig[:3, 3])
+        return f"QueryResult({self.status_text}, at ({position}), {self.num_inliers} inliers, {self.found_by})"
+
+    def scaled(self, factor: float) -> Self:
+        """Return the result with all lengths multiplied by a factor."""
+        pose, covariance, factors = self.world_from_rig, self.covariance, np.repeat([1.0, factor], 3)
+        return replace(
+            self,
+            world_from_rig=None if pose is None else geometry.scaled(pose, factor),
+            covariance=None if covariance is None else covariance * np.outer(factors, factors),
+            correspondences=replace(self.correspondences, points=factor * self.correspondences.points),
+            rivals=tuple(Rival(geometry.scaled(rival.world_from_rig, factor), rival.support) for rival in self.rivals),
+        )
+
+    def to_row(self, timestamp: int, device_id: str) -> dict[str, Any]:
+        """Return the row of the query in `poses/<pair>.csv`, without its column `image`."""
+        focals = self.focals_px if np.isfinite(self.focals_px).any() else ()
+        centers = self.centers_px if np.isfinite(self.centers_px).any() else ()
+        numbers = {name: round(getattr(self, name), digits) for name, digits in _NUMBERS.items()}
+        return {
+            "timestamp": timestamp,
+            "device_id": device_id,
+            "status": self.status_text,
+            "method": self.found_by,
+            **numbers,
+            "references": ";".join(self.references),
+            "rejected": ";".join(self.rejected),
+            "focal_px": ";".join("" if np.isnan(focal) else f"{focal:.1f}" for focal in focals),
+            "principal_point_px": ";".join("" if np.isnan(x) else f"{x:.1f} {y:.1f}" for x, y in centers),
+            "reason": self.remark,
+            "first_status": self.first_status,
+            "first_seconds": self.first_seconds,
+        }
+
+    def with_row(self, row: Mapping[str, Any]) -> Self:
+        """Return the result that `to_row` made a row from; `self` has its pose, names and correspondences.
+
+        The row may lack columns, or have missing values.
+        """
+        known = {name: value for name, value in row.items() if not pd.isna(value)}
+        status, reason = Status.parse(str(known["status"]))
+        kinds = {name: type(getattr(self, name)) for name in _NUMBERS if name not in _FROM_OTHERS}
+        return replace(
+            self,
+            status=status,
+            reason=reason,
+            found_by=str(known.get("method", "")),
+            remark=str(known.get("reason", "")),
+            first_status=known.get("first_status"),
+            first_seconds=known.get("first_seconds"),
+            **{name: kind(known[name]) for name, kind in kinds.items() if name in known},
+        )
+
+    def arrays(self) -> dict[str, Any]:
+        """Return pose, correspondences, rivals and names as arrays by name; texts as objects; see `from_arrays`."""
+        found = self.correspondences
+        arrays: dict[str, Any] = {key: getattr(found, key).astype(dtype) for key, (dtype, _) in _STORED.items()}
+        labels, codes = np.unique(found.found_by, return_inverse=True)
+        arrays |= {"found_by": codes.astype(np.uint8), "found_by_labels": labels.astype(object)}
+        arrays["world_from_rig"] = np.full((4, 4), np.nan) if self.world_from_rig is None else self.world_from_rig
+        arrays["covariance"] = np.full((6, 6), np.nan) if self.covariance is None else self.covariance
+        arrays["misfit"] = np.array(self.misfit)
+        arrays["rivals"] = np.array([rival.world_from_rig for rival in self.rivals]).reshape(-1, 4, 4)
+        arrays["rival_supports"] = np.array([rival.support for rival in self.rivals], np.float64)
+        return arrays | {name: np.array(getattr(self, name), object) for name in _NAMES}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Any]) -> Self:
+        """Return a result with the content of `arrays`; its status and numbers are in a row, see `with_row`.
+
+        Raises:
+            ValueError, KeyError: an array has another shape or is missing.
+        """
+        wide = {"f": np.float64, "i": np.int64, "b": np.bool_}
+        labels = np.array([_text(label) for label in arrays["found_by_labels"]], np.str_)
+        found_by = labels[arrays["found_by"].astype(np.int64)] if len(labels) else np.zeros(0, "U1")
+        read = {key: arrays[key].astype(wide[arrays[key].dtype.kind]) for key in _STORED}
+        for key, array in (read | {"found_by": found_by}).items():
+            count = len(read["view_of" if key.startswith("view_") else "camera"])
+            if array.shape != (count, *(_STORED[key][1] if key in _STORED else ())):
+                raise ValueError(f"{key} has the shape {array.shape}")
+        pose, covariance = arrays["world_from_rig"], arrays["covariance"]
+        images, references, rejected = (tuple(_text(text) for text in arrays[name]) for name in _NAMES)
+        return cls(
+            Status.FAILED,
+            world_from_rig=None if np.isnan(pose).all() else pose,
+            covariance=None if np.isnan(covariance).all() else covariance,
+            images=images,
+            references=references,
+            rejected=rejected,
+            correspondences=Correspondences(**read, found_by=found_by),
+            rivals=tuple(map(Rival, arrays["rivals"].reshape(-1, 4, 4), arrays["rival_supports"].tolist())),
+            misfit=bool(arrays["misfit"]),
+        )
+
+
+def _text(text: Any) -> str:
+    return text.decode() if isinstance(text, bytes) else str(text)
+
+
+def stds_of(covariances: Floats) -> tuple[Floats, Floats]:
+    """Return rotation standard deviations (...) in degrees and position ones (...) in meters, from (..., 6, 6).
+
+    Each is the root of a trace, that is, the root mean square length of the error vector.
+    """
+    rotation, position = (np.trace(covariances[..., s, s], axis1=-2, axis2=-1) for s in (slice(3), slice(3, 6)))
+    return np.degrees(np.sqrt(rotation)), np.sqrt(position)
+
+
+def carried_over(covariance: Floats, a_from_b: Floats) -> Floats:
+    """Convert the covariance (6, 6) of a pose from motions in frame b to motions in frame a; b is mounted on a."""
+    R, (x, y, z) = a_from_b[:3, :3], a_from_b[:3, 3]
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    adjoint = np.block([[R, np.zeros((3, 3))], [cross @ R, R]])
+    return np.asarray(adjoint @ covariance @ adjoint.T)
+
+
+def agree(world_from_rig: Floats | None, other: Floats | None, share: float = 1.0) -> bool:
+    """Tell whether two poses are close enough to confirm each other: within `share` of `AGREEMENT`."""
+    if world_from_rig is None or other is None:
+        return False
+    rotation_deg, distance_m = geometry.pose_error(world_from_rig, other)
+    return bool(rotation_deg <= share * AGREEMENT[0] and distance_m <= share * AGREEMENT[1])
+
+
+# Queries and localizers
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import pycolmap
 
 from toolkit import geometry
 from toolkit.capture import Session
-from toolkit.capture.cameras import rays_of
+from toolkit.capture.images import rays_of
 from toolkit.features.features import KINDS, FeatureKind, LocalFeatures
 from toolkit.features.matching import AnyMethod, PairMatches
 from toolkit.geometry import Floats, Ints
@@ -24,10 +24,9 @@ from toolkit.manifest import MapSettings, PnpSettings
 from toolkit.mapping.build import MAX_EPIPOLAR_ERROR_PX, instants, match_pairs, select_pairs
 from toolkit.mapping.local_map import LocalMap
 from toolkit.mapping.triangulation import triangulate
-from toolkit.pose.base import Localizer, Prior, Query, References
+from toolkit.pose.base import Localizer, Prior, Query, QueryResult, References
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer, PnpMatches
-from toolkit.pose.result import QueryResult
 from toolkit.threads import fixed_sums
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from toolkit import geometry
-from toolkit.capture.cameras import in_view
+from toolkit.capture.images import in_view
 from toolkit.features.features import KINDS, FeatureKind, LocalFeatures
 from toolkit.features.matching import Matcher, MutualMatcher, unit_descriptors
 from toolkit.geometry import Floats, Ints

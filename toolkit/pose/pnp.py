@@ -7,33 +7,67 @@ It takes two steps:
    their projections (guided matches). This finds several times as many matches, and refines the pose.
 
 Several kinds of features can be used together: one pose is estimated from the pooled matches of all kinds.
+
+The probability that a pose is correct, that is, within 5 degrees and 0.5 m of the true pose, is a logistic regression
+on statistics of the estimate. `benchmarks/confidence.py` fits the weights on rendered captures and on real images that
+it darkens, blurs, fogs and half covers, and measures the calibration on held-out ones.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtr, expit
 
 from toolkit import geometry
 from toolkit.alignment.robust import Bools
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import PnpSettings
-from toolkit.pose.base import Localizer, Prior, Query, QueryMatches, References
-from toolkit.pose.confidence import (
-    EVIDENCE,
-    bounded_by_deviation,
-    bounded_by_rivals,
-    odds_of_rivals,
-    probability_right,
+from toolkit.pose.base import (
+    CAMERA,
+    Correspondences,
+    Localizer,
+    Prior,
+    Query,
+    QueryMatches,
+    QueryResult,
+    References,
+    Rival,
+    Status,
+    agree,
 )
-from toolkit.pose.intrinsics_check import find_misfit
 from toolkit.pose.map_matching import MapMatcher, MappedFeatures, MatchCache, Vicinity
-from toolkit.pose.result import CAMERA, Correspondences, QueryResult, Rival, Status, agree
-from toolkit.pose.rig import CELLS, Matches, RigQuery, least_squares_covariance
+from toolkit.pose.rig import CELLS, Matches, RigQuery, find_misfit, least_squares_covariance
 from toolkit.threads import fixed_sums
 
+# Of the probability that a pose is correct
+EVIDENCE = (
+    "num_inliers", "inlier_ratio", "coverage", "rival_support", "position_std", "rotation_std_deg", "agreement"
+)  # fmt: skip
+"""Inputs of the regression: attributes of `QueryResult` and columns of `poses/<pair>.csv`."""
+WEIGHTS: dict[str, float] = {
+    "constant": -2.1948,
+    "log_inliers": 1.2564,
+    "inlier_ratio": 2.2838,
+    "coverage": 4.7817,
+    "rival_support": -2.8002,
+    "log_position_std": -0.0932,
+    "log_rotation_std": -0.6491,
+    "log_agreement": 0.4397,
+}
+"""Weights of the columns that `terms` returns, fitted by `benchmarks/confidence.py` on 2026-11-22 to 1,861 queries of
+rendered rooms and of real images made hard; `benchmarks/README.md` lists them, and what a fit to others gives."""
+RIVAL_SLOPE = 10.7
+"""How clearly support tells a pose from its rival. With it, a pose is `ok` beside a rival of up to 0.7 of its support.
+Then 1 % of all `ok` poses are wrong in the worst case, ten rendered captures whose two rooms are copies (`demo-data
+--alike`, seeds 0 to 9, SIFT, 2026-11-27); there alone, 6.2 would be the most probable value. Where nothing is a copy
+(STRECHA_HARD), none of the 13 poses with a rival above 0.5 is wrong."""
+LIMITS = (0.5, 5.0)  # meters, degrees: a pose within them is correct
+MARGIN = 1.5  # factor on stated deviations, which are right only to about as much
+
+# Of the search for the pose
 PNP_FORMAT = 8
 """Version of the poses. Increase when the same settings and files give other poses, or they are written otherwise."""
 FIRST_REFERENCES = {2: 200, 4: 100}
@@ -61,7 +95,7 @@ RIVAL_DISTANCE, NEAR_DISTANCE = 0.5, 0.05
 than the second, the pose is uncertain."""
 MAX_RIVAL_SUPPORT = 0.8
 """A pose is `ok` only if the best rival pose has at most this fraction of its support. With the default
-`ok_probability` the limit is 0.7, see `confidence.py`."""
+`ok_probability` the limit is 0.7, see `benchmarks/confidence.py`."""
 GUIDED_RADII_DEG = (0.7, 0.35)
 """Guided matching: search radius around each projected map point, degrees; one pass per radius."""
 MAX_GUIDED_MATCHES = 1000
@@ -74,6 +108,66 @@ GUIDED_WEIGHT = 0.5
 medians of 0.7 (drone), 0.9, 1.4 (kitchen) and 1.0 (STRECHA); with 0: 0.2, 0.9, 1.1, 0.8; with 1: 0.9, 1.0, 1.6, 1.2."""
 VIEWS = 4
 """Number of references whose keypoints are stored with the correspondences: those that observe the most of them."""
+
+
+def bounded_by_deviation(probability: float, position_std: float, rotation_std_deg: float) -> float:
+    """Return the probability that a pose is correct, at most what its standard deviations leave.
+
+    The probability that normal errors with `MARGIN` times these deviations, equal along three axes, are within
+    `LIMITS`.
+
+    Args:
+        probability: that of the pose without this bound.
+        position_std: of the pose, map lengths, see `Survey.length`, as in `EVIDENCE`.
+        rotation_std_deg: of the pose.
+    """
+    stds = MARGIN * np.array([position_std, rotation_std_deg]) / np.sqrt(3)
+    within = chdtr(3, (np.array(LIMITS) / np.maximum(stds, 1e-9)) ** 2)  # scipy.stats takes 0.5 s to import
+    return float(min(probability, np.nan_to_num(within.prod(), nan=0.0)))
+
+
+def bounded_by_rivals(probability: float, supports: Sequence[float]) -> float:
+    """Return the probability that a pose is correct, at most what its rivals leave: one half for one of equal support.
+
+    Args:
+        probability: that of the pose alone, see `probability_right`.
+        supports: of the rivals, relative to that of the pose.
+    """
+    return float(min(probability, 1 / (1 + odds_of_rivals(supports).sum())))
+
+
+def odds_of_rivals(supports: Sequence[float]) -> Floats:
+    """Return how probable each rival is, relative to the pose, from its relative support: 1 for equal support."""
+    relative = np.clip(np.array(supports, np.float64), 1e-3, 1.0)
+    return np.asarray(np.exp(-RIVAL_SLOPE * (1 / relative - 1)), np.float64)
+
+
+def terms(evidence: Mapping[str, Floats | float]) -> Floats:
+    """Return the terms of the regression, in the order of `WEIGHTS`, (..., 8).
+
+    Args:
+        evidence: the quantities in `EVIDENCE`, as numbers or arrays of equal shape, one entry per pose.
+    """
+    values = (np.asarray(evidence[name], np.float64) for name in EVIDENCE)
+    inliers, ratio, coverage, rival, position, rotation, agreement = values
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logarithms = np.log(position), np.log(rotation), np.log1p(agreement)
+        return np.stack([np.ones_like(inliers), np.log(inliers), ratio, coverage, rival, *logarithms], axis=-1)
+
+
+def probability_right(evidence: Mapping[str, Floats | float], weights: Floats | None = None) -> Floats:
+    """Return the probability that each pose is correct, shaped like the evidence; 0 if a standard deviation is unknown.
+
+    Args:
+        evidence: as for `terms`.
+        weights: (8,); None takes `WEIGHTS`.
+    """
+    weights = np.array(list(WEIGHTS.values())) if weights is None else weights
+    with np.errstate(invalid="ignore"):  # unknown deviations
+        return np.asarray(np.nan_to_num(expit(terms(evidence) @ weights), nan=0.0), np.float64)
+
+
+# The search for the pose
 
 
 @dataclass(frozen=True)

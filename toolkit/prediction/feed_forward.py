@@ -15,16 +15,27 @@ from toolkit import geometry
 from toolkit.alignment.robust import AlignmentError, robust_mean_pose
 from toolkit.alignment.similarity import Alignment, align_to_map, is_trustworthy, query_pose
 from toolkit.capture import Session
-from toolkit.capture.cameras import in_view, view_bounds
 from toolkit.capture.depths import DepthMaps, SeenDepth, lifted
+from toolkit.capture.images import in_view, view_bounds
 from toolkit.capture.upright import Turns
 from toolkit.errors import first_line, reason_of
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import PredictorSettings
 from toolkit.mapping.local_map import LocalMap
 from toolkit.models.compute import RUNNING
-from toolkit.pose.base import Localizer, Prior, Query, QueryInput, QueryMatches, References, View
-from toolkit.pose.result import CAMERA, QueryResult, Status, carried_over
+from toolkit.pose.base import (
+    CAMERA,
+    Localizer,
+    Prior,
+    Query,
+    QueryInput,
+    QueryMatches,
+    QueryResult,
+    References,
+    Status,
+    View,
+    carried_over,
+)
 from toolkit.prediction.interface import Prediction, Predictor
 from toolkit.threads import fixed_sums
 

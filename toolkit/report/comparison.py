@@ -15,8 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from toolkit.capture import Capture
-from toolkit.capture.devices import extra_devices
-from toolkit.capture.names import allow_outside
+from toolkit.capture.names import allow_outside, extra_devices
 from toolkit.errors import COMMAND, ArtifactError, ToolkitError
 from toolkit.figures.query_images import draw_localization
 from toolkit.figures.style import BLUE, GREEN, ORANGE, SKY, VERMILLION, new_figure, number, percent, styled
@@ -25,7 +24,7 @@ from toolkit.geometry import Floats, Ints
 from toolkit.report.page import off_by, read_run, seconds_text
 from toolkit.results.localized import LocalizedPair
 from toolkit.results.metrics import is_below, named_as_meters, named_by_unit, parse_threshold, threshold_text, unit_of
-from toolkit.results.opening import SESSIONS_ROOT, how_localized
+from toolkit.results.pair import SESSIONS_ROOT, how_localized
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -17,7 +17,7 @@ from markupsafe import Markup, escape
 
 from toolkit.capture.tables import POSES_UNIT
 from toolkit.errors import ArtifactError
-from toolkit.figures.sequences import CHANGES
+from toolkit.figures.evaluation import CHANGES
 from toolkit.figures.style import as_jpeg, number, percent
 from toolkit.files import (
     SceneFiles,
@@ -29,7 +29,7 @@ from toolkit.files import (
     write_sidecar,
     write_text,
 )
-from toolkit.pose.result import Status, status_counts, statuses
+from toolkit.pose.base import Status, status_counts, statuses
 from toolkit.report import review
 from toolkit.report.review import Interval
 from toolkit.results import metrics

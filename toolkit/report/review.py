@@ -8,15 +8,14 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from toolkit.capture.devices import in_order
+from toolkit.capture.names import in_order
 from toolkit.errors import ArtifactError
 from toolkit.figures.evaluation import wilson_interval
 from toolkit.figures.style import percent
 from toolkit.files import SceneFiles, map_record_path, pair_devices, read_map_record, write_text
 from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings
-from toolkit.pose.result import status_counts
-from toolkit.results.opening import AnySettings, read_settings
-from toolkit.results.pair import load_maps, map_files
+from toolkit.pose.base import status_counts
+from toolkit.results.pair import AnySettings, load_maps, map_files, read_settings
 
 PAIR = ["map_device", "query_device"]
 COUNTS = ["queries", "ok", "low_confidence", "failed"]

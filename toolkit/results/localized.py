@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from toolkit.capture import Capture, Session
 from toolkit.geometry import Floats, Ints
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.base import View
-from toolkit.pose.result import QueryResult, Status
+from toolkit.pose.base import QueryResult, Status, View
 from toolkit.results.metrics import is_posed
 from toolkit.results.pair import PairResults
 

@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from toolkit.capture.cameras import in_view, view_bounds
+from toolkit.capture.images import in_view, view_bounds
 from toolkit.files import image_name
 from toolkit.geometry import Floats, Ints, invert, pose_error, transform
-from toolkit.pose.result import Status, statuses
+from toolkit.pose.base import Status, statuses
 from toolkit.runs.folder import counted
 
 if TYPE_CHECKING:

@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, Any
 from tqdm.auto import tqdm
 
 from toolkit import __version__
-from toolkit.capture.devices import EXTRA_DEVICES
 from toolkit.capture.images import WORKERS, default_workers
-from toolkit.capture.names import ALLOW_OUTSIDE
+from toolkit.capture.names import ALLOW_OUTSIDE, EXTRA_DEVICES
 from toolkit.errors import ManifestError, ToolkitError, first_line, optional
 from toolkit.files import environment_variable
 from toolkit.threads import fixed_sums

@@ -13,8 +13,7 @@ from toolkit import geometry
 from toolkit.errors import CameraError, ImageError
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import SequenceSettings
-from toolkit.pose.base import RoughPose
-from toolkit.pose.result import QueryResult, Status, carried_over
+from toolkit.pose.base import QueryResult, RoughPose, Status, carried_over
 from toolkit.scene.map import Map, localize_image
 from toolkit.scene.query import Image
 from toolkit.sequences.odometry import Odometry, cut, with_measured_drift

@@ -39,6 +39,7 @@ from toolkit.mapping.build import build_map
 from toolkit.mapping.local_map import Consistency, LocalMap, map_path
 from toolkit.mapping.pose_consistency import NOMINAL_DEPTH, USUAL_DEPTHS_M
 from toolkit.pose.base import (
+    CAMERA,
     SEARCH_DEG,
     Localizer,
     NearestLocalizer,
@@ -46,40 +47,49 @@ from toolkit.pose.base import (
     Query,
     QueryInput,
     QueryMatches,
+    QueryResult,
     References,
     RoughPose,
+    Status,
     View,
 )  # fmt: skip
 from toolkit.pose.local_triangulation import OnDemandLocalizer, PosedImages
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer
-from toolkit.pose.result import CAMERA, QueryResult, Status
 from toolkit.prediction.feed_forward import FeedForwardLocalizer, depth_of_images
-from toolkit.prediction.hybrid import HybridLocalizer
+from toolkit.prediction.hybrid import HybridLocalizer, LiftingLocalizer, lifts
 from toolkit.prediction.interface import Predictor
-from toolkit.prediction.lifting import LiftingLocalizer, lifts
 from toolkit.prediction.network import open_predictor
 from toolkit.results.metrics import UNKNOWN_UNIT, is_posed, length_unit
-from toolkit.results.opening import (
+from toolkit.results.pair import (
     RETRIEVAL,
     SESSIONS_ROOT,
     Localized,
+    find_query,
     how_localized,
     last_localized,
     map_inputs,
     pairs_in_map,
 )  # fmt: skip
-from toolkit.results.pair import find_query
-from toolkit.scene.located import Located, Retrieved, ranks, show_matches
-from toolkit.scene.query import Image, camera_key, guessed_camera, query_from, with_focal
-from toolkit.scene.search import ReferenceSearch
+from toolkit.scene.query import (
+    Image,
+    Located,
+    ReferenceSearch,
+    Retrieved,
+    camera_key,
+    guessed_camera,
+    query_from,
+    ranks,
+    show_matches,
+    with_focal,
+)
 from toolkit.threads import fixed_sums
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from toolkit.figures.answers import Answer
-    from toolkit.viewer.inline import View3D
+    from toolkit.viewer.queries import View3D
 
 log = logging.getLogger(__name__)
 
@@ -264,7 +274,7 @@ class Map:
         if near is not None:
             allowed = [self._may_show(pose, near) for pose in near.world_from_rig @ query.rig_from_cams]
         for rows, scores in self.search.find(query, k, allowed):
-            indices = np.array([self.index_of.get(self.session.image_name(int(row)), -1) for row in rows], np.int64)
+            indices = np.array([self.index_of.get(self.session.image_names[row], -1) for row in rows], np.int64)
             references.append(References(indices[indices >= 0], scores[indices >= 0]))
         return references
 
@@ -291,7 +301,7 @@ class Map:
 
     def show_3d(self) -> "View3D":
         """Return the map in 3D: points and cameras; see `QueryResult.show_3d`."""
-        from toolkit.viewer.inline import View3D
+        from toolkit.viewer.queries import View3D
 
         return View3D([], False, self.session, self.points, self.settings.world_up, length_unit(self.record()))
 
@@ -610,7 +620,7 @@ class Map:
 
     def load(self) -> None:
         """Load what all queries share, before several threads find it missing: `cached_property` has no lock."""
-        _ = self.localizer, self.index_of, self.fallback
+        _ = self.localizer, self.index_of, self.fallback, self.session.image_names
         self.search.load()
         for kind in self.escalation:
             _ = kind.extractor

@@ -19,8 +19,7 @@ from toolkit import geometry
 from toolkit.errors import ArtifactError, optional
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import SequenceSettings
-from toolkit.pose.base import RoughPose
-from toolkit.pose.result import QueryResult, Status, agree, stds_of
+from toolkit.pose.base import QueryResult, RoughPose, Status, agree, stds_of
 from toolkit.sequences.odometry import (
     UNKNOWN_COVARIANCE,
     Odometry,

@@ -22,9 +22,18 @@ from toolkit.errors import CaptureError
 from toolkit.files import write_folder
 from toolkit.geometry import Floats, invert, make_pose
 from toolkit.manifest import nearest
-from toolkit.synthetic.capture import Tables, names_of, save_image, shaken, subsession_of
-from toolkit.synthetic.devices import BODY_FROM_LEVEL_CAM, Device, Sensor, looking
-from toolkit.synthetic.scene import named_rng
+from toolkit.synthetic.capture import (
+    BODY_FROM_LEVEL_CAM,
+    Device,
+    Sensor,
+    Tables,
+    looking,
+    names_of,
+    save_image,
+    shaken,
+    subsession_of,
+)
+from toolkit.synthetic.render import named_rng
 from toolkit.synthetic.textures import Image, Rng
 
 KINDS = {"strecha": False, "strecha-hard": True}

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike
 from tqdm.auto import tqdm
 
 from toolkit.capture import DEPTH_SCALE, RAW_DATA, Capture, Session, Trajectory
-from toolkit.capture.devices import color_of
 from toolkit.capture.images import decode, default_workers, prefetch, read_for_display, read_image
+from toolkit.capture.names import color_of
 from toolkit.capture.upright import up_of_cameras
 from toolkit.errors import ArtifactError, CaptureError, ImageError
 from toolkit.figures.style import ORANGE
@@ -26,7 +26,7 @@ from toolkit.geometry import Floats, Ints, local_origin, shifted
 from toolkit.results.localized import sure_points
 from toolkit.results.metrics import is_posed
 from toolkit.results.pair import PairResults, load_maps, map_files
-from toolkit.viewer import blueprint as viewer
+from toolkit.viewer import queries as viewer
 
 if TYPE_CHECKING:
     import pycolmap

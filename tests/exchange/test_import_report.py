@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from toolkit.__main__ import app
 from toolkit.errors import CaptureError, ManifestError
-from toolkit.exchange.new_manifest import TEMPLATE, new_manifest
+from toolkit.exchange.import_report import TEMPLATE, new_manifest
 from toolkit.manifest import load_manifest
 
 

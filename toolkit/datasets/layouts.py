@@ -24,7 +24,7 @@ from toolkit.exchange.import_report import ImportReport
 from toolkit.exchange.interchange import camera_at
 from toolkit.exchange.recordings import MAX_OFFSET_S, lines_of, numbers_of, read_track
 from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
-from toolkit.manifest import nearest
+from toolkit.manifest import nearest, require_known
 
 HOLD_OUT = 8
 """Every such photograph becomes a query, in data sets without a split."""
@@ -76,8 +76,7 @@ def import_dataset(
         CaptureError: a file of the data set is missing or malformed (names file and line); a session exists already,
             or has no usable image.
     """
-    if kind not in LAYOUTS:
-        raise ManifestError(f"dataset: unknown {kind!r}. {nearest(kind, LAYOUTS)}")
+    require_known("dataset", kind, LAYOUTS)
     if every < 1:
         raise ManifestError(f"every: found {every}, expected at least 1.")
     layout, folder = LAYOUTS[kind], Path(path) / (scene or "")

@@ -15,8 +15,8 @@ from toolkit.__main__ import app
 from toolkit.capture import Capture
 from toolkit.capture.check import check_capture
 from toolkit.capture.depths import DepthMaps
+from toolkit.datasets.layouts import LAYOUTS, import_dataset
 from toolkit.errors import CaptureError, ManifestError
-from toolkit.exchange.datasets import LAYOUTS, import_dataset
 from toolkit.geometry import Floats, invert, make_pose, qt_from_pose, quaternion_to_rotation
 
 Poses = dict[str, Floats]

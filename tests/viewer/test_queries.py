@@ -11,8 +11,7 @@ from tests.displayed import picture_of
 from toolkit.errors import ArtifactError
 from toolkit.figures.style import new_figure
 from toolkit.notebook import TEXT_BARS
-from toolkit.viewer.blueprint import open_recording
-from toolkit.viewer.inline import ASSETS, show_recording
+from toolkit.viewer.queries import ASSETS, open_recording, show_recording
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ import pytest
 from tqdm import tqdm
 
 from tests.fake_hub import FakeHub, serving, use_hub
-from toolkit.exchange import download
-from toolkit.exchange.download import RemoteFile
+from toolkit.datasets import download
+from toolkit.datasets.download import RemoteFile
 
 BODY = random.Random(0).randbytes(600_000)
 

@@ -6,8 +6,7 @@ import pytest
 from numpy.typing import NDArray
 
 from toolkit import geometry
-from toolkit.pose.intrinsics_check import MAX_SHARES, Misfit, find_misfit
-from toolkit.pose.rig import Matches, RigQuery
+from toolkit.pose.rig import MAX_SHARES, Matches, Misfit, RigQuery, find_misfit
 
 Floats = NDArray[np.float64]
 MAX_ERROR_DEG = 0.45

@@ -16,8 +16,7 @@ from scipy.ndimage import map_coordinates
 from tests.models.test_da3 import tiny as da3
 from tests.models.test_omega import tiny as omega
 from tests.models.test_vggt import tiny
-from toolkit.capture.images import read_image
-from toolkit.capture.upright import turn_image, turn_points, turned_from_cam
+from toolkit.capture.images import read_image, turn_image, turn_points, turned_from_cam
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
 from toolkit.geometry import invert
 from toolkit.manifest import LocalizeSettings
@@ -29,8 +28,7 @@ from toolkit.models.omega import VGGTOmega
 from toolkit.models.omega import load_images as load_omega_images
 from toolkit.models.vggt import VGGT, cameras_from_pose_encoding, load_images
 from toolkit.pose.base import View
-from toolkit.prediction.architectures import ARCHITECTURES, PlacedView, shown_size
-from toolkit.prediction.interface import Prediction
+from toolkit.prediction.interface import ARCHITECTURES, PlacedView, Prediction, shown_size
 from toolkit.prediction.network import NetworkPredictor, TokenCache, open_predictor
 
 # In the network 518 x 112, 518 x 126 and 112 x 518 pixels.

@@ -13,8 +13,7 @@ from tests.mapping.test_build import PINHOLE, assert_equal, looking_at
 from tests.queries import ask
 from toolkit import geometry
 from toolkit.capture import Capture, Session
-from toolkit.features.features import LocalFeatures
-from toolkit.features.sift import SiftExtractor, SiftSettings
+from toolkit.features.features import LocalFeatures, SiftExtractor, SiftSettings
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import sweep_partials, temporary_folder
 from toolkit.manifest import MapSettings
@@ -22,8 +21,7 @@ from toolkit.mapping import build as mapping
 from toolkit.mapping import local_map as local_maps
 from toolkit.mapping.build import MapPlan, build_map
 from toolkit.mapping.local_map import ORDERS, LocalMap
-from toolkit.mapping.tiles import JoinedImages, Tile, home_of, join_tiles, plan_tiles
-from toolkit.mapping.triangulation import triangulate
+from toolkit.mapping.triangulation import JoinedImages, Tile, home_of, join_tiles, plan_tiles, triangulate
 from toolkit.pose.base import Query, References, View
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer

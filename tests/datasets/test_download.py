@@ -25,10 +25,10 @@ from filelock import FileLock
 from tests.fake_hub import FakeHub, serving, use_hub
 from toolkit import pipeline
 from toolkit.capture import Capture
+from toolkit.datasets import download as archives
+from toolkit.datasets import download as module
+from toolkit.datasets.download import arrange, download, is_unfinished, unpack
 from toolkit.errors import COMMAND, CaptureError, DownloadError, ManifestError, sentence
-from toolkit.exchange import download as archives
-from toolkit.exchange import download as module
-from toolkit.exchange.download import arrange, download, is_unfinished, unpack
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 REPO = "Someone/PLACE-challenge-test"

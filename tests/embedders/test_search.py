@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from toolkit.capture.masks import Masks
 from toolkit.embedders import StoredVectors, Vectors
-from toolkit.embedders import index as index_module
-from toolkit.embedders.index import load_index, make_index
-from toolkit.embedders.search import search
+from toolkit.embedders import search as index_module
+from toolkit.embedders.search import load_index, make_index, search
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.files import sidecar_path
 from toolkit.manifest import RetrieveSettings

@@ -15,12 +15,11 @@ from toolkit.errors import ArtifactError
 from toolkit.figures.answers import Answer
 from toolkit.files import SceneFiles
 from toolkit.geometry import transform
-from toolkit.pose.base import Query, References
-from toolkit.pose.result import QueryResult, Rival, Status
+from toolkit.pose.base import Query, QueryResult, References, Rival, Status
 from toolkit.runs.kernel import TEXT_BARS
-from toolkit.scene.inspection import InspectedPair
 from toolkit.scene.map import Map
-from toolkit.viewer.inline import View3D
+from toolkit.scene.run import InspectedPair
+from toolkit.viewer.queries import View3D
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +164,7 @@ def test_a_map_and_results_are_shown_in_3d(
 
 
 def test_the_eye_sees_the_chosen_camera_in_the_middle(scene_map: Map) -> None:
-    from toolkit.figures.scene_3d import Eye
+    from toolkit.figures.top_view import Eye
 
     poses, up = scene_map.session.world_from_cam(), np.array([0.0, 0.0, 2.0])
     away = poses[0] + 1000 * np.eye(4)[:, [3]] * np.array([0, 0, 0, 1])
