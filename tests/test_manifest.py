@@ -42,6 +42,12 @@ def test_paths_are_relative_to_the_manifest_and_expanded(
     assert manifest.captures == [str(tmp_path.parent / "here"), "/data/sets/there", "/home/me/home"]
     assert manifest.output_root == str(tmp_path / "out")
     assert manifest.name == "mine"
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    changed = load_manifest(path, ["retrieve.mask.poses=rough.txt", "output_root=~/out"])
+    assert changed.retrieve.mask.poses == str(tmp_path / "elsewhere" / "rough.txt"), "as the shell completes it"
+    assert changed.output_root == "/home/me/out"
+    assert changed.captures == manifest.captures
 
 
 def write_files(folder: Path, **texts: str) -> Path:

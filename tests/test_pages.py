@@ -1,9 +1,14 @@
-"""The commands of README.md and of pages of docs/, run as they stand and in their order, on small inputs."""
+"""The commands of README.md and of the pages of docs/, run as they stand and in their order, on small inputs."""
 
 import json
+import os
+import re
 import shlex
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +19,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.datasets.test_layouts import seven_scenes
+from tests.exchange.test_submission import DEVICES, make_capture, make_poses
 from tests.test_docs import ROOT, commands_of
 from toolkit.__main__ import app
 from toolkit.capture import Session
@@ -21,16 +27,38 @@ from toolkit.exchange.export import export_table
 from toolkit.exchange.georeference import geographic
 from toolkit.geometry import Floats, pose_from_qt
 
-PAGES = ("README.md", "docs/own-data.md", "docs/coming-from.md", "docs/settings.md", "docs/index.md",
-         "docs/reading-results.md")  # fmt: skip
+FIRST = [ROOT / name for name in ("README.md", "docs/own-data.md", "docs/coming-from.md", "docs/settings.md",
+                                  "docs/index.md", "docs/reading-results.md")]  # fmt: skip
+"""Pages that make what the others change, in their order."""
+PAGES = [*FIRST, *sorted({*(ROOT / "docs").rglob("*.md")} - {*FIRST})]
 NOT_RUN = {
     "git clone": "needs the network",
+    "python -m pip": "needs the network",
+    ".venv/bin/python -m pip": "needs the network",
+    "visloc download": "needs the network; tests/exchange/test_download.py has a server",
     "make demo": "installs the packages; tests/test_package.py installs a wheel and runs the demo",
+    "make lab": "serves until it is stopped; tests/test_lab.py starts it",
+    "make test-gpu": "needs a GPU",
+    "make bench-gpu": "needs a GPU",
+    "CUDA_VISIBLE_DEVICES=1 visloc run MANIFEST": "needs two GPUs",
+    "visloc run data_manifests/my-place.yaml --set embed.model=megaloc": "needs the weights of MegaLoc",
+    "visloc run data_manifests/my-place.yaml --set localize.method=hybrid": "needs weights of VGGT, Depth Anything 3",
     "visloc run MANIFEST": "a whole run for each setting; tests/test_docs.py checks that the settings exist",
     "visloc compare": "needs the true poses of queries; tests/report/test_comparison.py has them",
     "visloc record": "opens a window",
     ".venv/bin/rerun": "opens a window",
     "visloc run data_manifests/CHESS.yaml": "needs the photographs of 7-Scenes; tests/test_accuracy.py has real ones",
+    "visloc run data_manifests/crocodl-hydro.yaml": "needs the photographs of CroCoDL",
+    "visloc run data_manifests/strecha.yaml": "needs a real capture; so does tests/test_accuracy.py",
+    "visloc run data_manifests/NIGHT.yaml": "needs the photographs of Strecha et al.",
+    "visloc import dataset strecha": "needs the photographs of Strecha et al.",
+    "make bench-paper": "needs the photographs of Strecha et al.",
+    ".venv/bin/python benchmarks/": "needs a real capture; tests/test_benchmark_reader.py has their options",
+    ".venv/bin/python -m pytest": "tests of their own",
+    ".venv/bin/python -m tests.fuzz": "takes an hour; tests/fuzz/ has the first seconds",
+    "visloc demo-data --out data/BIG": "renders for minutes; tests/synthetic/ has small captures",
+    "export CAPTURES": "a variable of commands that are not run",
+    "PHOTOS=": "a variable of commands that are not run",
 }
 """What cannot run here, by how its line begins, and why."""
 ALONE = (
@@ -49,14 +77,14 @@ ORIGIN = np.array([47.37, 8.54, 408.0])
 
 def commands() -> Iterator[str]:
     """Yield the commands of the pages in their order, each once."""
-    lines = [line for page in PAGES for line in commands_of(ROOT / page)]
+    lines = [re.sub(" +", " ", line) for page in PAGES for line in commands_of(page)]
     yield from dict.fromkeys(lines)
 
 
 def test_what_is_not_run_is_on_a_page() -> None:
     lines = [*commands()]
     assert all(any(f"{line}\n".startswith(start) for line in lines) for start in (*NOT_RUN, *ALONE))
-    assert len([line for line in lines if not line.startswith((*NOT_RUN,))]) > 25
+    assert len([line for line in lines if not line.startswith((*NOT_RUN,))]) > 35
 
 
 @pytest.fixture
@@ -87,6 +115,9 @@ def inputs(small_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         sphere = np.random.default_rng(0).integers(0, 255, (256, 512, 3), np.uint8)
         PIL.Image.fromarray(sphere).save(Path(folder) / names[0])
     seven_scenes(tmp_path / "DATASETS" / "7scenes")
+    Path("method.txt").write_text("SIFT, thresholds as published, https://example.org/code")
+    for scene in ("HYDRO", "SUCCULENT"):
+        write_challenge_run(Path("runs") / scene.lower(), make_capture(tmp_path / "CAPTURES", scene))
     return tmp_path
 
 
@@ -128,6 +159,14 @@ def write_recording(names: list[str], posed: dict[str, Floats]) -> None:
             PIL.Image.new("I;16", image.size, 2000).save(Path("DEPTH") / f"{Path(name).stem}.png")
 
 
+def write_challenge_run(run: Path, capture: Path) -> None:
+    """Write the poses and references of all pairs of a capture of the challenge."""
+    for pair in product(DEVICES, DEVICES):
+        make_poses(run, capture.name, *pair)
+    stages = [{"scene": capture.name, "parameters": {"sessions_root": str(capture / "sessions")}}]
+    (run / "run.json").write_text(json.dumps({"manifest": {}, "stages": stages}))
+
+
 def write_model(found: Path) -> None:
     """Write the model that `reconstruct` has found as that of IMAGES."""
     model = pycolmap.Reconstruction(found)
@@ -150,7 +189,14 @@ def test_commands_run_as_they_stand(inputs: Path, released_weights: None) -> Non
                 remove(Path(path))
         if "runs/demo" in line:
             shutil.copytree("runs/my-place", "runs/demo")
+        if "rough.txt" in line:  # the same format
+            shutil.copy("runs/my-place/MY_PLACE/poses/MY_PLACE_map_ios_query_ios.txt", "rough.txt")
         words = shell_words(line)
+        if words[0] == ".venv/bin/python":  # from the repository's root
+            subprocess.run(
+                [sys.executable, *words[1:]], cwd=ROOT, check=True, env={**os.environ, "PYTHONPATH": str(ROOT)}
+            )
+            continue
         assert words[0] == "visloc", line
         done = CliRunner().invoke(app, words[1:], catch_exceptions=True)
         assert done.exit_code == 0, f"{line}\n{done.output[-2000:]}\n{done.exception}"
@@ -166,6 +212,9 @@ def test_commands_run_as_they_stand(inputs: Path, released_weights: None) -> Non
         "runs/my-place/report.html",
         "data_manifests/CHESS.yaml",
         "out/features.h5",
+        "runs/hydro/submission.zip",
+        "runs/my-place-poses-rough.txt/report.html",
+        "runs/my-place-samples-6/report.html",
     ):
         assert Path(made).is_file(), made
     assert [*Path("out/pictures").rglob("*.jpg")]

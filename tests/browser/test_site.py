@@ -63,6 +63,11 @@ def test_pages_need_no_other_machine_and_fit_a_phone(browser: "Browser", site: P
             assert all("ERR_ABORTED" in failure for failure in traffic.failed), name
             too_wide = page.evaluate("document.documentElement.scrollWidth - window.innerWidth")
             assert too_wide <= 0, f"{name} is {too_wide} pixels wider than the window"
+            cut_off = page.evaluate(
+                "[...document.querySelectorAll('.md-content pre > code')]"
+                ".filter(code => code.scrollWidth > code.clientWidth).map(code => code.innerText)"
+            )
+            assert not cut_off, f"{name}: {cut_off}"
             pictures = page.evaluate("[...document.images].map(image => [image.src, image.alt, image.naturalWidth])")
             assert all(alt and width for _, alt, width in pictures), pictures
         page.goto(f"http://127.0.0.1:{server.server_port}/how/localize.html")

@@ -10,7 +10,7 @@ import yaml
 
 from toolkit.errors import ManifestError
 from toolkit.files import SceneFiles, write_text
-from toolkit.manifest import Manifest, load_manifest
+from toolkit.manifest import STAGES, Manifest, load_manifest
 from toolkit.pipeline import sweep
 from toolkit.runs.folder import RunLog, changed_keys, swept_runs, take_over, variant_name
 from toolkit.store.items import Items
@@ -77,6 +77,19 @@ def test_the_record_of_a_run_that_reranks_is_read_again(tmp_path: Path) -> None:
     RunLog(donor.run, Manifest.of({"name": "a", **settings}), {}, "code").write()
     own = Manifest.of({"name": "b", **settings, "visualize": {"samples": 6}})
     take_over([donor.run], own)
+    assert SceneFiles(tmp_path / "b", "P").poses_dir.is_dir()
+
+
+@pytest.mark.parametrize("null", [{"unit": None}, {"localize": {"map": None}}])
+def test_the_record_of_a_run_says_what_is_null(tmp_path: Path, null: dict[str, Any]) -> None:
+    """As `visloc new` writes it for an unknown unit; the record once had the default, so nothing was taken over."""
+    settings = {"name": "a", "captures": ["P"], "output_root": str(tmp_path), **null}
+    donor = SceneFiles(tmp_path / "a", "P")
+    donor.poses_dir.mkdir(parents=True)
+    RunLog(donor.run, Manifest.of(settings), {}, "code").write()
+    record = Manifest.of(json.loads((donor.run / "run.json").read_text())["manifest"])
+    assert all(record.stage(stage) == Manifest.of(settings).stage(stage) for stage in STAGES)
+    take_over([donor.run], Manifest.of({**settings, "name": "b", "visualize": {"samples": 6}}))
     assert SceneFiles(tmp_path / "b", "P").poses_dir.is_dir()
 
 

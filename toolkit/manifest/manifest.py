@@ -269,7 +269,8 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
     by key, while lists and values are replaced. A path is relative to the folder of the file that contains it.
 
     Args:
-        overrides: `key=value` or `section.key=value` at any depth, the value in YAML; merged over the file.
+        overrides: `key=value` or `section.key=value` at any depth, the value in YAML; merged over the file. Their paths
+            are relative to the working directory, where the user types them.
 
     Raises:
         ManifestError: names the file (also the inherited one), the key, what was found, and the nearest known key.
@@ -279,7 +280,8 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
     chain = _read_chain(path, ())
     # `output_root` is a path like any other.
     raw: dict[str, Any] = {"name": path.stem, "output_root": Manifest.model_fields["output_root"].default}
-    for content in [*(content for _, content in chain), *map(_read_override, overrides)]:
+    typed = [_anchor(_read_override(override), Path.cwd()) for override in overrides]
+    for content in [*(content for _, content in chain), *typed]:
         raw = merge(raw, expand(Manifest, content))
     raw = _map_paths(raw, lambda text, key: str(_expand(text, path.resolve().parent, f"{source}: {key}")))
     try:
@@ -358,7 +360,7 @@ def _map_paths(raw: dict[str, Any], change: Callable[[str, str], str], where: st
 
 
 def _anchor(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the values of an inherited file with its paths made absolute, relative to its own folder."""
+    """Return the values of an inherited file, or of `--set`, with paths made absolute, relative to a folder."""
 
     def anchor(text: str, key: str) -> str:
         if text.startswith("~") or "$" in os.path.expandvars(text):

@@ -39,6 +39,7 @@ from toolkit.files import (
     write_text,
 )
 from toolkit.manifest import STAGES, Manifest
+from toolkit.manifest.settings import merge
 
 log = logging.getLogger(__name__)
 LOG, RECORD = "run.log", "run.json"
@@ -202,6 +203,7 @@ class RunLog:
         """Write the current state to `run.json`."""
         rows = self.all_rows()
         as_taken = self.manifest.model_copy(update={one: self.manifest.stage(one) for one in self.manifest.stages})
+        all_set = as_taken.model_dump(mode="json", exclude_none=True)
         work = sum(row.get("work_seconds", 0.0) for row in rows if row["status"] == "done")
         content = {
             "name": self.manifest.name,
@@ -211,7 +213,8 @@ class RunLog:
             "failed": failures(rows),
             "created": self.created,
             "pid": os.getpid(),
-            "manifest": as_taken.model_dump(mode="json", exclude_none=True),
+            # Null is left out where it is the default: it is said where it turns something off, as `unit: null`.
+            "manifest": merge(all_set, as_taken.model_dump(mode="json", exclude_defaults=True)),
             "versions": _versions(),
             "machine": machine(),
             "code": self.code,
