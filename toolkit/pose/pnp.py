@@ -34,7 +34,7 @@ from toolkit.pose.result import CAMERA, Correspondences, QueryResult, Rival, Sta
 from toolkit.pose.rig import CELLS, Matches, RigQuery, least_squares_covariance
 from toolkit.threads import fixed_sums
 
-PNP_FORMAT = 8
+PNP_FORMAT = 9
 """Version of the poses. Increase when the same settings and files give other poses, or they are written otherwise."""
 FIRST_REFERENCES = {2: 200, 4: 100}
 """Number of references per image to match first -> independent inliers that their pose needs to be kept. The next
@@ -42,8 +42,8 @@ number, and finally all references, are matched if the pose has fewer, or if too
 MIN_SHARED_POINTS = 12
 """A map image that observes at least so many inliers shows their place, so it cannot be of a rival."""
 CLEAR_INLIER_RATIO = 0.56
-"""Above this share of inliers among the matches, no rival pose is searched: the remaining matches are usually too few
-to support one beyond `MAX_RIVAL_SUPPORT`."""
+"""Above this share of inliers among the matches, a rival is searched among the other matches alone: its support may be
+near that of the pose, see `RIVAL_SHARE`, but a pose near by can no longer be the better one."""
 CONTESTED_INLIER_RATIO = 0.4
 """Below this share of inliers, the pose may mix two places: RANSAC runs again with the tighter `max_error_deg`, and
 separately for single references."""
@@ -298,9 +298,8 @@ class PnpLocalizer(Localizer):
         hypotheses = [self._improve(query, start, matches)]
         inliers = self._inliers(query, hypotheses[0].rig_from_world, matches)
         share = float(inliers.mean())
-        if share > CLEAR_INLIER_RATIO:
-            return hypotheses
-        if share < CONTESTED_INLIER_RATIO:
+        clear, contested = share > CLEAR_INLIER_RATIO, share < CONTESTED_INLIER_RATIO
+        if contested:
             other = self._ransac(query, first_matches, settings.max_error_deg)
             if other is not None:
                 hypotheses.append(self._improve(query, other, matches))
@@ -308,14 +307,16 @@ class PnpLocalizer(Localizer):
         rest = matches[~inliers]
         # A pose with a smaller share of inliers is no rival.
         least = RIVAL_SHARE * int(inliers.sum())
-        other = self._ransac(query, rest, settings.ransac_max_error_deg, least_inliers=int(least))
-        if other is not None:
-            count = self._inliers(query, other, rest).sum()
-            if share < CONTESTED_INLIER_RATIO or count >= least:
-                hypotheses.append(self._improve(query, other, matches))
-        if share < CONTESTED_INLIER_RATIO:
+        enough = contested or len(rest) >= least
+        other = self._ransac(query, rest, settings.ransac_max_error_deg, int(least)) if enough else None
+        if other is not None and (contested or self._inliers(query, other, rest).sum() >= least):
+            found = self._improve(query, other, matches)
+            if not clear or _differ(hypotheses[0], found):
+                hypotheses.append(found)
+        if contested:
             self._add_other_places(query, matches, references, hypotheses)
-        self._add_neighbor(query, matches, hypotheses)
+        if not clear:
+            self._add_neighbor(query, matches, hypotheses)
         return _best_first(hypotheses)
 
     def _add_other_places(
