@@ -31,9 +31,10 @@ rendered rooms and of real images made hard; `benchmarks/README.md` lists them, 
 
 RIVAL_SLOPE = 10.7
 """How clearly support tells a pose from its rival. With it, a pose is `ok` beside a rival of up to 0.7 of its support.
-Then 1 % of all `ok` poses are wrong in the worst case, ten rendered captures whose two rooms are copies (`demo-data
---alike`, seeds 0 to 9, SIFT, 2026-11-27); there alone, 6.2 would be the most probable value. Where nothing is a copy
-(STRECHA_HARD), none of the 13 poses with a rival above 0.5 is wrong."""
+`benchmarks/confidence.py`, 2026-11-28, on rendered captures whose two rooms are copies (`demo-data --alike`, SIFT): the
+most probable value is 5.7 (seeds 0 to 9) and 3.3 (10 to 13); at most 1 % of `ok` poses are wrong up to 15.4 and 7.3, by
+all up to 7.5. So of copies, 1.5 % of `ok` poses are wrong. Where nothing is a copy (STRECHA_HARD, castle-P30 made
+hard), all 23 `ok` poses with a rival above 0.5 are right; 7.0 would refuse 15 of them."""
 
 
 LIMITS = (0.5, 5.0)  # meters, degrees: a pose within them is correct
