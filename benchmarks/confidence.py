@@ -40,6 +40,7 @@ OK = 0.99
 SIGNS = {"log_inliers": 1, "inlier_ratio": 1, "coverage": 1, "rival_support": -1, "log_position_std": -1,
          "log_rotation_std": -1, "log_agreement": 1}  # fmt: skip
 """Of the weights: more inliers never make a pose less probable, whatever some hundred rows say."""
+SLOPES = np.arange(1.0, 20.0, 0.1)  # tried for `RIVAL_SLOPE`
 BINS = (0.0, 0.1, 0.5, 0.9, 0.99, 1.0)
 DEGRADATIONS = ("none", "dark", "blurred", "fog", "hidden", "dark, hidden")
 SOLD_OFTEN = ("books", "crate", "door", "drawers", "window")  # materials of which there are few models
@@ -225,6 +226,24 @@ def judge(rows: pd.DataFrame, probability: NDArray[np.float64]) -> dict[str, flo
     return {"accepted": count, "wrong": wrong, "upper": upper, "right": right, "found": (count - wrong) / max(right, 1)}
 
 
+def rival_slopes(rows: pd.DataFrame) -> tuple[float, float]:
+    """Return the most probable `RIVAL_SLOPE`, and the largest with which at most 1 % of all `ok` poses are wrong."""
+    from toolkit.pose import confidence
+
+    support = np.clip(rows["rival_support"].to_numpy(np.float64), 0.05, 1)
+    rival = rows["posed"] & ~rows["refused"] & (rows["rival_support"] > 0)
+    with patch.object(confidence, "RIVAL_SLOPE", np.inf):  # all else that bounds the probability
+        unequal = rows.assign(rival_support=rows["rival_support"].clip(upper=0.999))
+        most = stated(unequal, np.array(list(confidence.WEIGHTS.values())))
+    loss, holds = [], []
+    for slope in SLOPES:
+        odds = np.exp(-slope * (1 / support - 1))
+        judged = judge(rows, np.minimum(most, 1 / (1 + odds)))
+        loss.append(np.log1p(np.where(rows["wrong"], 1 / odds, odds))[rival].sum())
+        holds.append(judged["wrong"] <= (1 - OK) * judged["accepted"])
+    return float(SLOPES[np.argmin(loss)]), max(SLOPES[holds].tolist(), default=float("nan"))
+
+
 def markdown(rows: pd.DataFrame, held_out: list[str]) -> str:
     """Return the weights, and how they hold on scenes that they were not fitted on."""
     from toolkit.pose.pnp import WEIGHTS
@@ -238,6 +257,11 @@ def markdown(rows: pd.DataFrame, held_out: list[str]) -> str:
     probability[other.index] = stated(other, weights)
     text = [f"{len(rows)} queries, weights fitted on {len(learned)}:", ""]
     text += [markdown_table(["term", "weight"], [[n, f"{w:.4f}"] for n, w in zip(WEIGHTS, weights, strict=True)]), ""]
+    for name, part in (("fitted on", learned), ("held out", other)):
+        if (part["rival_support"] > 0).any():
+            likely, largest = rival_slopes(part)
+            told = f"{likely:.1f} is most probable; up to {largest:.1f}, at most 1 % of `ok` poses are wrong."
+            text += [f"`RIVAL_SLOPE` by scenes {name}: {told}", ""]
     for column in ("scene", "way", "escalated"):
         table = []
         for group, part in [*rows.groupby(column), ("all", rows)]:

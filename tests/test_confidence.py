@@ -135,3 +135,13 @@ def test_rivals_bound_the_probability() -> None:
     bounds = [bounded_by_rivals(1.0, [support]) for support in np.linspace(0, 1, 11)]
     assert bounds == sorted(bounds, reverse=True), "more support of a rival never makes the pose more probable"
     assert bounded_by_rivals(0.3, [0.1]) == 0.3
+
+
+def test_the_slope_that_made_the_rivals_is_found(confidence: ModuleType) -> None:
+    rng = np.random.default_rng(0)
+    made = rows(4000, num_inliers=1000, coverage=1.0)
+    made["rival_support"] = rng.uniform(0.3, 1, len(made))
+    made["wrong"] = rng.uniform(size=len(made)) > 1 / (1 + np.exp(-8 * (1 / made["rival_support"] - 1)))
+    likely, largest = confidence.rival_slopes(made)
+    assert likely == pytest.approx(8, abs=1)
+    assert largest > likely, "most poses that are `ok` are surer than 99 %"

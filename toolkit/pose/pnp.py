@@ -61,14 +61,15 @@ WEIGHTS: dict[str, float] = {
 rendered rooms and of real images made hard; `benchmarks/README.md` lists them, and what a fit to others gives."""
 RIVAL_SLOPE = 10.7
 """How clearly support tells a pose from its rival. With it, a pose is `ok` beside a rival of up to 0.7 of its support.
-Then 1 % of all `ok` poses are wrong in the worst case, ten rendered captures whose two rooms are copies (`demo-data
---alike`, seeds 0 to 9, SIFT, 2026-11-27); there alone, 6.2 would be the most probable value. Where nothing is a copy
-(STRECHA_HARD), none of the 13 poses with a rival above 0.5 is wrong."""
+`benchmarks/confidence.py`, 2026-11-28, on rendered captures whose two rooms are copies (`demo-data --alike`, SIFT): the
+most probable value is 5.7 (seeds 0 to 9) and 3.3 (10 to 13); at most 1 % of `ok` poses are wrong up to 15.4 and 7.3, by
+all up to 7.5. So of copies, 1.5 % of `ok` poses are wrong. Where nothing is a copy (STRECHA_HARD, castle-P30 made
+hard), all 23 `ok` poses with a rival above 0.5 are right; 7.0 would refuse 15 of them."""
 LIMITS = (0.5, 5.0)  # meters, degrees: a pose within them is correct
 MARGIN = 1.5  # factor on stated deviations, which are right only to about as much
 
 # Of the search for the pose
-PNP_FORMAT = 8
+PNP_FORMAT = 9
 """Version of the poses. Increase when the same settings and files give other poses, or they are written otherwise."""
 FIRST_REFERENCES = {2: 200, 4: 100}
 """Number of references per image to match first -> independent inliers that their pose needs to be kept. The next
@@ -76,8 +77,8 @@ number, and finally all references, are matched if the pose has fewer, or if too
 MIN_SHARED_POINTS = 12
 """A map image that observes at least so many inliers shows their place, so it cannot be of a rival."""
 CLEAR_INLIER_RATIO = 0.56
-"""Above this share of inliers among the matches, no rival pose is searched: the remaining matches are usually too few
-to support one beyond `MAX_RIVAL_SUPPORT`."""
+"""Above this share of inliers among the matches, a rival is searched among the other matches alone: its support may be
+near that of the pose, see `RIVAL_SHARE`, but a pose near by can no longer be the better one."""
 CONTESTED_INLIER_RATIO = 0.4
 """Below this share of inliers, the pose may mix two places: RANSAC runs again with the tighter `max_error_deg`, and
 separately for single references."""
@@ -392,9 +393,8 @@ class PnpLocalizer(Localizer):
         hypotheses = [self._improve(query, start, matches)]
         inliers = self._inliers(query, hypotheses[0].rig_from_world, matches)
         share = float(inliers.mean())
-        if share > CLEAR_INLIER_RATIO:
-            return hypotheses
-        if share < CONTESTED_INLIER_RATIO:
+        clear, contested = share > CLEAR_INLIER_RATIO, share < CONTESTED_INLIER_RATIO
+        if contested:
             other = self._ransac(query, first_matches, settings.max_error_deg)
             if other is not None:
                 hypotheses.append(self._improve(query, other, matches))
@@ -402,14 +402,16 @@ class PnpLocalizer(Localizer):
         rest = matches[~inliers]
         # A pose with a smaller share of inliers is no rival.
         least = RIVAL_SHARE * int(inliers.sum())
-        other = self._ransac(query, rest, settings.ransac_max_error_deg, least_inliers=int(least))
-        if other is not None:
-            count = self._inliers(query, other, rest).sum()
-            if share < CONTESTED_INLIER_RATIO or count >= least:
-                hypotheses.append(self._improve(query, other, matches))
-        if share < CONTESTED_INLIER_RATIO:
+        enough = contested or len(rest) >= least
+        other = self._ransac(query, rest, settings.ransac_max_error_deg, int(least)) if enough else None
+        if other is not None and (contested or self._inliers(query, other, rest).sum() >= least):
+            found = self._improve(query, other, matches)
+            if not clear or _differ(hypotheses[0], found):
+                hypotheses.append(found)
+        if contested:
             self._add_other_places(query, matches, references, hypotheses)
-        self._add_neighbor(query, matches, hypotheses)
+        if not clear:
+            self._add_neighbor(query, matches, hypotheses)
         return _best_first(hypotheses)
 
     def _add_other_places(
