@@ -228,13 +228,13 @@ def judge(rows: pd.DataFrame, probability: NDArray[np.float64]) -> dict[str, flo
 
 def rival_slopes(rows: pd.DataFrame) -> tuple[float, float]:
     """Return the most probable `RIVAL_SLOPE`, and the largest with which at most 1 % of all `ok` poses are wrong."""
-    from toolkit.pose import confidence
+    from toolkit.pose import pnp
 
     support = np.clip(rows["rival_support"].to_numpy(np.float64), 0.05, 1)
     rival = rows["posed"] & ~rows["refused"] & (rows["rival_support"] > 0)
-    with patch.object(confidence, "RIVAL_SLOPE", np.inf):  # all else that bounds the probability
+    with patch.object(pnp, "RIVAL_SLOPE", np.inf):  # all else that bounds the probability
         unequal = rows.assign(rival_support=rows["rival_support"].clip(upper=0.999))
-        most = stated(unequal, np.array(list(confidence.WEIGHTS.values())))
+        most = stated(unequal, np.array(list(pnp.WEIGHTS.values())))
     loss, holds = [], []
     for slope in SLOPES:
         odds = np.exp(-slope * (1 / support - 1))
