@@ -5,7 +5,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -237,8 +237,8 @@ _Todo = tuple[str, str, int]
 _Task = tuple[int, QueryInput, Any, float]
 """Number of a query, the query, what is known of it (a prediction, or its first result), and seconds spent on it."""
 _FEW, _RETRIED = "/few", "/retried"
-"""End the names of a query's items with the fallback features, of few references and of all. They have no arrays if the
-first correspondences count."""
+"""End the names of a query's items with the fallback features, of few references and of all: an item's name chooses the
+references. It has no arrays if earlier correspondences count."""
 
 
 class _Pair:
@@ -343,7 +343,8 @@ class _Pair:
         self.map = self.stage.open_map(self.devices[0])
         self.stored = StoredQueries(self.session, self.retrieval)
         if self.map.settings.method not in WITHOUT_FEATURES:
-            self._add_features(self.map.kinds, {number: self.query(number)[1] for number in range(len(self.keys))})
+            references = partial(self.stored.references_of, self.map)
+            self._add_features(self.map.kinds, {number: references(rows) for number, rows in enumerate(self.rows)})
         return self
 
     def _add_features(self, kinds: Sequence[AnyMethod], asked: Mapping[int, Sequence[References]]) -> None:
@@ -407,9 +408,8 @@ class _Pair:
                 if number in faulty:
                     row, arrays = faulty[number].to_row(*self.keys[number]), faulty[number].arrays()
                 else:
-                    ends = (end for end in (_RETRIED, _FEW) if items.is_current(name + end, source))
-                    last = name + next(ends, "")
-                    row, arrays = items.note(last), items[last] or items[name]
+                    known = [name + end for end in (_RETRIED, _FEW, "") if items.is_current(name + end, source)]
+                    row, arrays = items.note(known[0]), next(filter(None, map(items.__getitem__, known)))
                 rows[name] = row | {key: arrays[key] for key in ("world_from_rig", "covariance")}
                 yield name, arrays
 
@@ -424,7 +424,7 @@ class _Pair:
         return self.localize_into(items, todo, *retry_s)
 
     def _stored(self, items: Items, todo: _Todo, end: str = "") -> QueryResult:
-        """Return the stored result of a query: from the features that every query has, or of a retry."""
+        """Return the stored result of a query: from the features that every query has, or of the retry with an end."""
         name = todo[0].removesuffix(_FEW).removesuffix(_RETRIED)
         return QueryResult.from_arrays(items[name + end] or items[name]).with_row(items.note(name + end))
 
@@ -436,12 +436,16 @@ class _Pair:
         if todo[0].endswith(_FEW):
             return len(self.map.rounds(query[1], first)) > 1
         few = items.is_current(todo[0].removesuffix(_RETRIED) + _FEW, todo[1])
-        return not few or self.map.is_unsure(self._stored(items, todo, _FEW))
+        return not few or not self.map.is_settled(first, self._stored(items, todo, _FEW))
 
     def _retried(self, items: Items, todo: _Todo) -> tuple[Query, Sequence[References], QueryResult]:
-        """Return a query that is retried, the references that it asks, and its first result."""
+        """Return a query that is retried, the references that it asks, and its latest result."""
         first, (query, references) = self._stored(items, todo), self.query(todo[2])
-        return query, self.map.rounds(references, first)[0 if todo[0].endswith(_FEW) else -1], first
+        rounds = self.map.rounds(references, first)
+        if todo[0].endswith(_FEW):
+            return query, rounds[0], first
+        few = items.is_current(todo[0].removesuffix(_RETRIED) + _FEW, todo[1])
+        return query, rounds[-1], self._stored(items, todo, _FEW) if few else first
 
     def add_fallback(self, items: Items, todo: Sequence[_Todo]) -> None:
         """Extract and match the fallback features of queries."""

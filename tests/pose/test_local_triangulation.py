@@ -192,6 +192,12 @@ def test_references_of_one_query_image_only() -> None:
     estimate = scene.localizer().localize(rig, [scene.references[0], nothing, scene.references[0]])
     assert_right(estimate)
     assert set(estimate.correspondences.camera) <= {0, 1}
+    # A run stores no matches of an image that it cannot read; asking for them failed the whole query.
+    with_first = scene.localizer().match(rig, [scene.references[0], nothing, nothing])
+    stored = dict(zip(scene.names, map(with_first.query.network_matches[0][0], scene.names), strict=True))
+    rig = replace(rig, network_matches=[[stored.__getitem__], [{}.__getitem__], [{}.__getitem__]])
+    again = scene.localizer().localize(rig, [scene.references[0], nothing, scene.references[0]])
+    np.testing.assert_array_equal(again.world_from_rig, estimate.world_from_rig)
 
 
 def test_points_of_the_map_keep_their_index() -> None:

@@ -107,6 +107,37 @@ def test_an_ok_pose_asks_the_references_that_support_it_first() -> None:
     assert asked(vague) == [[[5, 2, 1, 0], [5]], every]
     assert asked(replace(vague, status=Status.LOW_CONFIDENCE)) == [every], "other references may show another place"
     assert asked(VAGUE) == [every]
+    assert asked(replace(VAGUE, references=tuple("fedcba"[:4]))) == [[[5, 4, 3, 2], [4, 5]], every]
+    references = [References.of([5, 2])]
+    assert asked(vague) == [[[5, 2]]], "they are all"
+
+
+def test_what_few_references_find_has_the_rivals_of_all_and_is_not_elsewhere() -> None:
+    """Few references do not show the places of the others, and so once made a pose of two places sure."""
+    scene, there, nearby, far = Scene(), np.eye(4), np.eye(4), np.eye(4)
+    there[0, 3], nearby[0, 3], far[0, 3] = 28.0, 0.02, 2.0
+    first = replace(VAGUE, references=("c",), rivals=(Rival(there, 0.6), Rival(nearby, 0.4)), p_correct=0.995)
+    precise = replace(OK, p_correct=1.0, rivals=(Rival(far, 0.3),))
+    extractor = SimpleNamespace(extract=lambda images: [scene.features[scene.names[0]]] * len(images), color=False)
+    kind = SimpleNamespace(name="sift", extractor=extractor)
+
+    def located(*answers: QueryResult) -> tuple[QueryResult, Scripted]:
+        further = Scripted(*answers)
+        scene_map = scripted_map(Scripted(first), further, [kind])
+        vars(scene_map)["index_of"] = {name: number for number, name in enumerate("abcdef")}
+        references = [References.of([3, 2])] * len(scene.query.views)
+        return scene_map.locate(with_pixels(scene.query), references=references), further
+
+    result, further = located(precise)
+    assert [(rival.world_from_rig[0, 3], rival.support) for rival in result.rivals] == [(28.0, 0.6), (2.0, 0.3)]
+    assert (result.status, result.rival_support, len(further.asked)) == (Status.OK, 0.6, 1)
+    assert 0.99 < result.p_correct < 1.0
+    assert [len(found.images) for found in result._in_map.open()[2]] == [2], "with all references"
+    elsewhere = replace(precise, world_from_rig=there)
+    result, further = located(elsewhere, elsewhere)
+    assert len(further.asked) == 2, "all references are asked"
+    result, further = located(replace(VAGUE, covariance=np.eye(6) / 4), FAILED)
+    assert (len(further.asked), result.position_std, result.first_status) == (2, VAGUE.position_std / 2, "ok")
 
 
 def test_what_the_first_attempt_knew_of_rivals_is_judged_by_all_features() -> None:

@@ -141,11 +141,13 @@ class OnDemandLocalizer(Localizer):
         to_match: dict[tuple[int, str], tuple[LocalFeatures, LocalFeatures]] = {}
         matches: list[dict[str, PairMatches]] = [{} for _ in query.views]
         for camera, (query_features, retrieved) in enumerate(zip(query.features, references, strict=True)):
+            if isinstance(query_features, str):
+                continue  # no matches of an unreadable image are stored
             stored = query.network_matches[camera][number] if query.network_matches else None
             for name in (self.posed.names[index] for index in retrieved.images):
                 if stored is not None:  # matches with an unreadable reference are not stored
                     matches[camera][name] = stored(name) if len(features[name]) else PairMatches.none()
-                elif not isinstance(query_features, str):
+                else:
                     to_match[camera, name] = query_features[number], features[name]
         with self._network:
             new_matches = method.matcher.match(list(to_match.values()))

@@ -52,10 +52,11 @@ from toolkit.pose.base import (
     RoughPose,
     Status,
     View,
+    agree,
 )  # fmt: skip
 from toolkit.pose.local_triangulation import OnDemandLocalizer, PosedImages
 from toolkit.pose.map_matching import MappedFeatures
-from toolkit.pose.pnp import PnpLocalizer
+from toolkit.pose.pnp import RIVAL_DISTANCE, PnpLocalizer, bounded_by_rivals
 from toolkit.prediction.feed_forward import FeedForwardLocalizer, depth_of_images
 from toolkit.prediction.hybrid import HybridLocalizer, LiftingLocalizer, lifts
 from toolkit.prediction.interface import Predictor
@@ -368,10 +369,10 @@ class Map:
             return result
         query, first = self._with_fallback_features(query), result
         for asked in self.rounds(references, first):
-            result = self.retry(query, asked, first, priors)
-            if not self.is_unsure(result):
+            result = self.retry(query, asked, result, priors)
+            if self.is_settled(first, result):
                 break
-        return replace(result, seconds=time.perf_counter() - started)
+        return result
 
     def predict(self, queries: Sequence[QueryInput]) -> list[Any]:
         """Return a network's prediction for each query, for `locate`; see `Localizer.predict`."""
@@ -401,7 +402,12 @@ class Map:
             return [references]
         best = [self.index_of[name] for name in first.references[:FEW_REFERENCES]]
         few = [found.take(np.isin(found.images, best)) for found in references]
-        return [few, references] if any(len(found.images) for found in few) else [references]
+        counts = [sum(len(found.images) for found in asked) for asked in (few, references)]
+        return [few, references] if 0 < counts[0] < counts[1] else [references]
+
+    def is_settled(self, first: QueryResult, result: QueryResult) -> bool:
+        """Tell whether few references have made the pose of the first result sure, and have not moved it elsewhere."""
+        return not self.is_unsure(result) and not self._differ(first.world_from_rig, result.world_from_rig)
 
     @fixed_sums
     def retry(
@@ -409,7 +415,7 @@ class Map:
     ) -> QueryResult:
         """Retry an unsure query with the fallback features, which it has; return the better of both results.
 
-        `found_by` names the fallback features if the pose was computed with them.
+        `first` is the latest result. `found_by` names the fallback features if the pose was computed with them.
         """
         assert self.fallback is not None
         started = time.perf_counter()
@@ -422,13 +428,40 @@ class Map:
         matches = self.match(query, references, self.fallback)
         result = self.solve(query, matches, None, [*priors, *known_priors], self.fallback)
         result = replace(result, found_by="+".join([result.found_by, *(kind.name for kind in self.escalation)]))
+        if first.status is Status.OK:
+            result = self._with_rivals_of(first, result)
         better = result.status.rank >= max(first.status.rank, 1)
+        earlier = first.first_seconds
         return replace(
             result if better else first,
             seconds=first.seconds + time.perf_counter() - started,
-            first_status=first.status_text,
-            first_seconds=round(first.seconds, 4),
+            first_status=first.first_status or first.status_text,
+            first_seconds=round(first.seconds, 4) if earlier is None else earlier,
+            context=first.context,  # it has all references
         )
+
+    def _with_rivals_of(self, first: QueryResult, result: QueryResult) -> QueryResult:
+        """Return a result that also has the rivals of an `ok` first one, whose places few references may not show."""
+        poses = [result.world_from_rig, *(rival.world_from_rig for rival in result.rivals)]
+        forgotten = [rival for rival in first.rivals if all(self._differ(rival.world_from_rig, pose) for pose in poses)]
+        if not forgotten or result.world_from_rig is None:
+            return result
+        rivals = sorted([*result.rivals, *forgotten], key=lambda rival: -rival.support)
+        probability = bounded_by_rivals(result.p_correct, [rival.support for rival in rivals])
+        return replace(
+            result,
+            status=Status.LOW_CONFIDENCE if probability < self.settings.pnp.ok_probability else result.status,
+            p_correct=probability,
+            rivals=tuple(rivals),
+            rival_support=rivals[0].support,
+        )
+
+    def _differ(self, world_from_rig: Floats | None, other: Floats | None) -> bool:
+        """Tell whether two poses are clearly different, in the lengths of the map."""
+        if world_from_rig is None or other is None:
+            return True
+        factor = 1 / self.length
+        return not agree(geometry.scaled(world_from_rig, factor), geometry.scaled(other, factor), RIVAL_DISTANCE)
 
     def finished(self, query: Query, result: QueryResult) -> QueryResult:
         """Return a result with the names of images and method; with low confidence if the map contradicts itself."""

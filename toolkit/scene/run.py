@@ -92,19 +92,23 @@ class StoredQueries:
         """Return the query in rows of `session.images`, which one device took at one instant, and the references of
         each of its images in the map; an image without an entry has none.
         """
-        query, images = scene_map.query_of_session(self.session, rows), self.session.images.iloc[rows]
-        names, index_of = [view.name for view in query.views], scene_map.index_of
+        query = scene_map.query_of_session(self.session, rows)
+        names = [view.name for view in query.views]
         stores = [] if scene_map.settings.method in WITHOUT_FEATURES else self.stores
         query = replace(
             query,
             features=[_features(stores, name) for name in names] if stores else [],
             network_matches=[_network_matches(self.matches, name) for name in names] if any(self.matches) else [],
         )
-        references = []
+        return query, self.references_of(scene_map, rows)
+
+    def references_of(self, scene_map: Map, rows: Ints) -> list[References]:
+        """Return the references in the map of the images in rows of `session.images`; none of one without an entry."""
+        images, index_of, references = self.session.images.iloc[rows], scene_map.index_of, []
         for key in zip(images["timestamp"].tolist(), images["sensor_id"].tolist(), strict=True):
             found = [(index_of[name], score) for name, score in self.references.get(key, []) if name in index_of]
             references.append(References.of([index for index, _ in found], [score for _, score in found]))
-        return query, references
+        return references
 
 
 def _features(stores: Sequence[FeatureStore], name: str) -> Any:
