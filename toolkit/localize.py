@@ -90,7 +90,7 @@ def localize_pairs(
     """Localize the queries of every pair of map device and query device.
 
     For each pair, writes the poses (`<pair>.txt`), a table with the status and quality of each (`<pair>.csv`), and the
-    correspondences that support each pose (`<pair>.h5`, see `pose.correspondences`). For each map, writes
+    correspondences that support each pose (`<pair>.h5`, see `pose.base.Correspondences`). For each map, writes
     `<scene>_map_<device>.json`, which says whether the map's poses agree with its images.
 
     Args:

@@ -62,8 +62,8 @@ Descriptors = NDArray[np.uint8] | NDArray[np.float16] | NDArray[np.float32]
 Shorten = Callable[[NDArray[np.float32]], NDArray[np.float32]]  # unit descriptors (N, D) -> shorter unit vectors
 
 # Of SIFT
-Floats = NDArray[np.float32]
-Levels = NDArray[np.int16]
+_Floats = NDArray[np.float32]
+_Levels = NDArray[np.int16]
 _FORMAT = 6  # Version of the features, part of the settings. Increase when the same settings give other features
 MIN_CONTRAST = 0.01  # smallest contrast of a keypoint, after the image's contrast is stretched to the full range
 _INTERVALS = 3  # number of levels per octave in which keypoints are detected
@@ -331,9 +331,9 @@ class SiftExtractor(Remade):
 class _Memory(threading.local):
     """The memory of a thread's largest pyramid, for its next one: the system takes long to give new memory."""
 
-    values: Levels = np.empty(0, np.int16)
+    values: _Levels = np.empty(0, np.int16)
 
-    def take(self, count: int) -> Levels:
+    def take(self, count: int) -> _Levels:
         """Return an array of this length; it may share its memory with the last one."""
         if count > _MOST_KEPT:
             return np.empty(count, np.int16)
@@ -359,7 +359,7 @@ class _Pyramid:
         ends = np.cumsum(len(_BLURS) * self.sizes)
         self.starts = ends - len(_BLURS) * self.sizes  # (O,) index in `values` at which each octave starts
         # The pixels of all levels, one level after the other, from 0 to `_WHITE`.
-        self.values: Levels = memory.take(ends[-1])
+        self.values: _Levels = memory.take(ends[-1])
         # For each octave, its levels (6, H, W): views of `values`.
         self.octaves = [
             self.values[start:end].reshape(-1, height, width)
@@ -383,7 +383,7 @@ class _Pyramid:
         return octave, np.stack([level, *np.divmod(in_level, self.widths[octave])])
 
 
-def _blur(image: Levels, sigma: float, wanted_sigma: float, out: Levels) -> None:
+def _blur(image: _Levels, sigma: float, wanted_sigma: float, out: _Levels) -> None:
     """Blur an image of blur `sigma` to a blur of `wanted_sigma`."""
     kernel_sigma = float(np.sqrt(wanted_sigma**2 - sigma**2))
     kernel_size = 2 * int(np.ceil(_KERNEL_SIGMAS * kernel_sigma)) + 1
@@ -395,17 +395,17 @@ class _Keypoints(NamedTuple):
 
     octave: Ints
     level: Ints  # level of the octave that has about the blur of the keypoint
-    x: Floats
-    y: Floats
-    sigma: Floats
-    response: Floats  # absolute difference of Gaussians at the keypoint, for gray values from 0 to 1
+    x: _Floats
+    y: _Floats
+    sigma: _Floats
+    response: _Floats  # absolute difference of Gaussians at the keypoint, for gray values from 0 to 1
 
     def take(self, part: Ints) -> "_Keypoints":
         columns: list[Any] = [column[part] for column in self]
         return _Keypoints(*columns)
 
 
-def _extrema(levels: Levels, contrast: float) -> Ints:
+def _extrema(levels: _Levels, contrast: float) -> Ints:
     """Return the extrema of the difference of Gaussians (6, H, W) of an octave among all 26 neighbors, as flat indices.
 
     Absolute values are compared: near the extremum of a smooth function, all values have the same sign. Of equal
@@ -467,14 +467,14 @@ def _detect(pyramid: _Pyramid, contrast: float) -> _Keypoints:
     )
 
 
-def _parabola(flat: Levels, at: Ints, width: Ints, size: Ints) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def _parabola(flat: _Levels, at: Ints, width: Ints, size: Ints) -> tuple[_Floats, _Floats, NDArray[np.bool_]]:
     """Fit a parabola at N extrema, flat indices `at` into the levels of all octaves, rows of `width` and levels of
     `size`.
 
     Return offsets (3, N) of the peaks in x, y and level, their heights (N,), and whether they are on an edge (N,).
     """
 
-    def value(offset: Ints | int) -> Floats:
+    def value(offset: Ints | int) -> _Floats:
         index = at + offset
         return (flat.take(index + size) - flat.take(index)) * np.float32(1 / _WHITE)
 
@@ -503,7 +503,7 @@ def _parabola(flat: Levels, at: Ints, width: Ints, size: Ints) -> tuple[Floats, 
 class _Grid(NamedTuple):
     """K positions around a keypoint at which gradients are sampled."""
 
-    xy1: Floats  # (K, 3) x and y in steps, multiples of a half, and ones
+    xy1: _Floats  # (K, 3) x and y in steps, multiples of a half, and ones
     step: float  # distance of two neighbors, in units of the keypoint's sigma
 
     @classmethod
@@ -512,7 +512,7 @@ class _Grid(NamedTuple):
         y, x = np.meshgrid(along, along, indexing="ij")
         return cls(np.stack([x.ravel(), y.ravel(), np.ones(x.size, np.float32)], axis=1), step)
 
-    def gradients(self, pyramid: _Pyramid, keypoints: _Keypoints, angles: Floats) -> tuple[Floats, Floats]:
+    def gradients(self, pyramid: _Pyramid, keypoints: _Keypoints, angles: _Floats) -> tuple[_Floats, _Floats]:
         """Return magnitude (K, N) and direction (K, N), 0 to 2 pi, of the gradients around N keypoints, on grids that
         are rotated by `angles` (N,), radians.
 
@@ -555,7 +555,7 @@ def _chunks(keypoints: _Keypoints) -> Iterator[Ints]:
         yield order[start : start + _CHUNK]
 
 
-def _orientations(pyramid: _Pyramid, keypoints: _Keypoints) -> tuple[Ints, Floats]:
+def _orientations(pyramid: _Pyramid, keypoints: _Keypoints) -> tuple[Ints, _Floats]:
     """Return the index of the keypoint (M,), ascending, and the angle (M,), radians, of M orientations."""
     histograms = np.zeros((len(keypoints.x), _BINS))
     for index in _chunks(keypoints):
@@ -575,7 +575,7 @@ def _orientations(pyramid: _Pyramid, keypoints: _Keypoints) -> tuple[Ints, Float
     return index, (bins * (2 * np.pi / _BINS)).astype(np.float32)
 
 
-def _descriptor_grid() -> tuple[_Grid, Floats]:
+def _descriptor_grid() -> tuple[_Grid, _Floats]:
     """Return the grid of the descriptor's K gradients, and the weight (16, K) of each in each cell, an integer."""
     along = (np.arange(15) - 7) / 3  # in cells: three gradients per cell, and half a cell more on both sides
     centers = np.arange(_CELLS) - (_CELLS - 1) / 2
@@ -587,7 +587,7 @@ def _descriptor_grid() -> tuple[_Grid, Floats]:
 _DESCRIPTOR, _CELL_WEIGHTS = _descriptor_grid()
 
 
-def _descriptors(pyramid: _Pyramid, keypoints: _Keypoints, angles: Floats) -> NDArray[np.uint8]:
+def _descriptors(pyramid: _Pyramid, keypoints: _Keypoints, angles: _Floats) -> NDArray[np.uint8]:
     """Return RootSIFT descriptors (N, 128)."""
     cells = np.empty((len(angles), _CELLS**2, _DIRECTIONS), np.float32)
     for index in _chunks(keypoints):

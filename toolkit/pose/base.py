@@ -159,7 +159,7 @@ class QueryResult:
     agreement: int = 0
     """Inliers of the second best kind of features; 0 if there is one kind."""
     p_correct: float = float("nan")
-    """Probability that the pose is within 5 degrees and 0.5 m, see `confidence`; NaN if it is not from matches."""
+    """Probability that the pose is within 5 degrees and 0.5 m, see `pose.pnp`; NaN if it is not from matches."""
     images: tuple[str, ...] = ()
     """Names of the C query images."""
     references: tuple[str, ...] = ()
@@ -178,8 +178,8 @@ class QueryResult:
     """Intrinsics that fit the query better than the stated ones; images that cannot be read; for a prediction, what was
     left out or is unknown. Column `reason` of the table."""
     misfit: bool = False
-    """Whether the matches contradict the intrinsics of the query, see `misfit`. More features cannot repair that. A
-    small contradiction only widens the covariance."""
+    """Whether the matches contradict the intrinsics of the query, see `rig.find_misfit`. No other features repair
+    that. A small contradiction only widens the covariance."""
     focals_px: tuple[float, ...] = ()
     """Per query image, the focal length that fits, or NaN if the focal length is not the problem. Empty if the
     intrinsics are not contradicted."""

@@ -48,10 +48,10 @@ from toolkit.results.pair import (
 from toolkit.runs.folder import RECORD
 from toolkit.runs.kernel import TEXT_BARS
 from toolkit.scene.map import WITHOUT_FEATURES, Map
+from toolkit.scene.query import Located, best_ranks
 
 if TYPE_CHECKING:
     from toolkit.figures.answers import Answer
-from toolkit.scene.query import Located, best_ranks
 
 WORST = "worst"
 """Alias for the number of the worst query."""
