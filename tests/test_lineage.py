@@ -258,8 +258,11 @@ def change(files: SceneFiles, what: str) -> None:
 
 @pytest.fixture
 def linked(small_run: Path, tmp_path: Path) -> SceneFiles:
-    """The small run, by hard links, so that nothing done here is done there."""
+    """The small run, by hard links, so that nothing done here is done there; a log grows in place, so it is a copy."""
     shutil.copytree(small_run, tmp_path / small_run.name, copy_function=link_or_copy)
+    log = tmp_path / small_run.name / "run.log"
+    log.unlink()
+    shutil.copy(small_run / log.name, log)
     return SceneFiles(tmp_path / small_run.name, "SMALL")
 
 
