@@ -423,33 +423,34 @@ class _Pair:
         todo = items.spread(_do_share, todo, arguments, self.label, "query", 1 if retry_s else size)
         return self.localize_into(items, todo, *retry_s)
 
-    def _stored(self, items: Items, todo: _Todo, end: str = "") -> QueryResult:
-        """Return the stored result of a query: from the features that every query has, or of the retry with an end."""
+    def _stored(self, items: Items, todo: _Todo) -> tuple[QueryResult, QueryResult]:
+        """Return the stored results of a query: from the features that every query has, and the latest of a retry."""
         name = todo[0].removesuffix(_FEW).removesuffix(_RETRIED)
-        return QueryResult.from_arrays(items[name + end] or items[name]).with_row(items.note(name + end))
+        first = QueryResult.from_arrays(items[name]).with_row(items.note(name))
+        if not items.is_current(name + _FEW, todo[1]):
+            return first, first
+        return first, QueryResult.from_arrays(items[name + _FEW] or items[name]).with_row(items.note(name + _FEW))
 
     def _is_open(self, items: Items, todo: _Todo) -> bool:
         """Tell whether a query should be retried with few references, or with all; see `Map.rounds`."""
-        first = self._stored(items, todo)
-        if not self.map.is_unsure(first) or not self.map.needs_fallback(*(query := self.query(todo[2])), first):
+        first, latest = self._stored(items, todo)
+        if not self.map.is_unsure(first):
             return False
-        if todo[0].endswith(_FEW):
-            return len(self.map.rounds(query[1], first)) > 1
-        few = items.is_current(todo[0].removesuffix(_RETRIED) + _FEW, todo[1])
-        return not few or not self.map.is_settled(first, self._stored(items, todo, _FEW))
+        query, references = self.query(todo[2])
+        if not self.map.needs_fallback(query, references, first):
+            return False
+        few = todo[0].endswith(_FEW)
+        return len(self.map.rounds(references, first)) > 1 if few else not self.map.is_settled(first, latest)
 
-    def _retried(self, items: Items, todo: _Todo) -> tuple[Query, Sequence[References], QueryResult]:
-        """Return a query that is retried, the references that it asks, and its latest result."""
-        first, (query, references) = self._stored(items, todo), self.query(todo[2])
-        rounds = self.map.rounds(references, first)
-        if todo[0].endswith(_FEW):
-            return query, rounds[0], first
-        few = items.is_current(todo[0].removesuffix(_RETRIED) + _FEW, todo[1])
-        return query, rounds[-1], self._stored(items, todo, _FEW) if few else first
+    def _asked(self, todo: _Todo, first: QueryResult) -> Sequence[References]:
+        """Return the references that a query asks in the round of its item, given its first result."""
+        references = self.stored.references_of(self.map, self.rows[todo[2]])
+        return self.map.rounds(references, first)[0 if todo[0].endswith(_FEW) else -1]
 
     def add_fallback(self, items: Items, todo: Sequence[_Todo]) -> None:
         """Extract and match the fallback features of queries."""
-        self._add_features(self.map.escalation, {one[2]: self._retried(items, one)[1] for one in todo})
+        asked = {one[2]: self._asked(one, self._stored(items, one)[0]) for one in todo}
+        self._add_features(self.map.escalation, asked)
 
     def localize_into(
         self, items: Items, todo: Sequence[_Todo], retry_s: float | None = None
@@ -460,13 +461,13 @@ class _Pair:
         With `retry_s`, retry unsure queries with the fallback features, whose extraction took these seconds per query;
         an item gets arrays only if the result is better.
         """
-        faulty, firsts = dict[int, QueryResult](), dict[int, QueryResult]()
+        faulty, earlier = dict[int, QueryResult](), dict[int, QueryResult]()
         of_number = {number: (name, source) for name, source, number in todo}
 
         def retried() -> Iterator[_Task]:
             for one in todo:
-                query, references, firsts[one[2]] = self._retried(items, one)
-                yield one[2], (query, references), firsts[one[2]], retry_s or 0.0
+                first, earlier[one[2]] = self._stored(items, one)
+                yield one[2], (self.query(one[2])[0], self._asked(one, first)), earlier[one[2]], retry_s or 0.0
 
         if retry_s is None:
             results = self._run(self._locate, self._predicted(list(of_number)), len(todo))
@@ -476,7 +477,7 @@ class _Pair:
             if result.is_internal:
                 faulty[number] = result
             else:
-                same = number in firsts and result.correspondences is firsts[number].correspondences
+                same = number in earlier and result.correspondences is earlier[number].correspondences
                 items.add(*of_number[number], None if same else result.arrays(), result.to_row(*self.keys[number]))
         return faulty
 
