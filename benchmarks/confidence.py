@@ -237,7 +237,8 @@ def rival_slopes(rows: pd.DataFrame) -> tuple[float, float]:
         most = stated(unequal, np.array(list(pnp.WEIGHTS.values())))
     loss, holds = [], []
     for slope in SLOPES:
-        odds = np.exp(-slope * (1 / support - 1))
+        with patch.object(pnp, "RIVAL_SLOPE", slope):
+            odds = pnp.odds_of_rivals(support)
         judged = judge(rows, np.minimum(most, 1 / (1 + odds)))
         loss.append(np.log1p(np.where(rows["wrong"], 1 / odds, odds))[rival].sum())
         holds.append(judged["wrong"] <= (1 - OK) * judged["accepted"])
