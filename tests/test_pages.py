@@ -35,7 +35,7 @@ NOT_RUN = {
     "git clone": "needs the network",
     "python -m pip": "needs the network",
     ".venv/bin/python -m pip": "needs the network",
-    "visloc download": "needs the network; tests/exchange/test_download.py has a server",
+    "visloc download": "needs the network; tests/datasets/test_download.py has a server",
     "make demo": "installs the packages; tests/test_package.py installs a wheel and runs the demo",
     "make lab": "serves until it is stopped; tests/test_lab.py starts it",
     "make test-gpu": "needs a GPU",
