@@ -357,6 +357,21 @@ def test_an_exception_in_one_query_does_not_end_the_run(
     assert "Traceback" in caplog.text
 
 
+def test_an_exception_in_a_retry_leaves_the_pose_that_was_found_before(
+    small_capture: Path, run: SceneFiles, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add_other_kind(monkeypatch)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Map, "retry", Mock(side_effect=ZeroDivisionError("by chance")))
+        run_stage(small_capture, run, query_device="ios", **ESCALATES)
+    rows = rows_of(run, "ios")
+    assert set(rows["status"]) == {"low_confidence"}
+    assert set(rows["reason"]) == {"internal: ZeroDivisionError: by chance"}
+    assert len(Trajectory.read(run.poses_txt("ios", "ios"))) == 3
+    run_stage(small_capture, run, query_device="ios", **ESCALATES)
+    assert rows_of(run, "ios")["first_status"].tolist() == ["low_confidence"] * 3, "the next run tries it again"
+
+
 def test_a_fault_of_the_toolkit_is_tried_again_by_the_next_run(
     small_capture: Path, run: SceneFiles, finished: tuple[SceneFiles, pd.DataFrame], monkeypatch: pytest.MonkeyPatch
 ) -> None:

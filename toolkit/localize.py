@@ -476,6 +476,9 @@ class _Pair:
         for number, result in results:
             if result.is_internal:
                 faulty[number] = result
+                if number in earlier and result.world_from_rig is None:  # what was found before the retry stays
+                    remark = "; ".join(filter(None, [earlier[number].remark, result.reason]))
+                    faulty[number] = replace(earlier[number], remark=remark)
             else:
                 same = number in earlier and result.correspondences is earlier[number].correspondences
                 items.add(*of_number[number], None if same else result.arrays(), result.to_row(*self.keys[number]))
