@@ -244,6 +244,17 @@ def test_nothing_fits(tmp_path: Path) -> None:
     assert not (tmp_path / "PLACE/sessions").exists()
 
 
+def test_a_focal_length_in_exif_that_no_model_fits_is_estimated(photographs: Path, tmp_path: Path) -> None:
+    """It was kept as the start, and "no two of 3 photographs fit together" did not name it."""
+    exif = PIL.Image.Exif()
+    exif[0x0110], exif.get_ifd(0x8769)[0xA405] = "Camera 5", 400
+    for path in sorted(photographs.glob("0*"))[:3]:
+        PIL.Image.open(path).save(tmp_path / f"{path.stem}.png", exif=exif)
+    made = reconstruct([tmp_path], tmp_path / "PLACE")
+    assert made.report.images["status"].eq("imported").all()
+    assert "started at 1.2 times the longer side" in made.report.text()
+
+
 @pytest.mark.parametrize(
     ("options", "error"),
     [

@@ -225,6 +225,15 @@ class _Work:
         with _quiet():
             pycolmap.create_pose_prior_bundle_adjuster(options, found, config, priors, model).solve()
 
+    def forget_focal_lengths(self) -> bool:
+        """Start focal lengths from EXIF as if EXIF had none, and tell whether there are any: no model may fit them."""
+        guessed = [camera for number, camera in enumerate(self.cameras)
+                   if camera.has_prior_focal_length and number not in self.known]  # fmt: skip
+        for camera in guessed:
+            camera.params = [FOCAL_PRIOR * max(camera.width, camera.height), *camera.params[1:]]
+            camera.has_prior_focal_length = False
+        return bool(guessed)
+
     def match(self, kind: int, pairs: Sequence[tuple[int, int]]) -> None:
         """Match pairs and keep the matches that agree with one relative pose of their cameras."""
         method, store = self.kinds[kind]
@@ -475,6 +484,8 @@ def reconstruct(
     matcher.strongest = STRONGEST if len(pairs) > FEW_PAIRS else None
     work.match(0, pairs)
     models = work.map(mapper)
+    if not models and work.forget_focal_lengths():
+        models = work.map(mapper)
     notes = _escalate(work, models)
     if len(work.kinds) > 1 and any(work.pairs[1]):
         models = work.map(mapper)
