@@ -574,7 +574,7 @@ class LocalizeSettings(Settings):
     @model_validator(mode="after")
     def _unit_or_map(self) -> Self:
         if self.unit is None and self.map is None:
-            raise ValueError("unit and map are null; without a unit, limits are relative to the depth in the map")
+            raise ValueError("unit and map are null. Give `unit: m`, or a map: by its depth, limits are without a unit")
         return self
 
 
