@@ -383,6 +383,39 @@ def test_names_that_differ_a_little_from_their_files(listed: str, stored: str, f
     np.testing.assert_allclose(poses_of(Capture.open(tmp_path / "PLACE")["ios_map"])[stored], pose(3), atol=1e-9)
 
 
+@pytest.mark.parametrize("root", ["/home/me/photos/", "C:\\photos\\", "./"])
+def test_paths_of_another_machine_are_found_by_their_ends(root: str, tmp_path: Path) -> None:
+    """As in a transforms.json; of a model or a table, the images were left out."""
+    photos = tmp_path / "photos"
+    save(photos / "a.jpg")
+    save(photos / "b" / "c.jpg")
+    names = [root + "a.jpg", root + ("b\\c.jpg" if "\\" in root else "b/c.jpg"), "/home/other/b/c.png"]
+    table = write_table(tmp_path / "t.csv", names, [pose(3), pose(4), pose(5)])
+    report = import_images(photos, tmp_path / "PLACE", split="map", table=table, camera=CAMERA)
+    status = report.images.set_index("image")["status"]
+    assert status.to_dict() == {
+        "a.jpg": "imported", "b/c.jpg": "imported", names[2]: "not a path inside the folder of images"
+    }  # fmt: skip
+    np.testing.assert_allclose(poses_of(Capture.open(tmp_path / "PLACE")["ios_map"])["b/c.jpg"], pose(4), atol=1e-9)
+    assert any("2 images have paths of another machine" in note for note in report.notes) == (root != "./")
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_a_table_may_be_separated_as_spreadsheets_do(separator: str, tmp_path: Path) -> None:
+    save(tmp_path / "photos" / "a.jpg")
+    table = write_table(tmp_path / "t.csv", ["a.jpg"], [pose(3)])
+    table.write_text(table.read_text().replace(",", separator))
+    report = import_images(tmp_path / "photos", tmp_path / "PLACE", split="map", table=table, camera=CAMERA)
+    assert report.images["status"].tolist() == ["imported"]
+
+
+def test_a_table_without_images_is_named(tmp_path: Path) -> None:
+    save(tmp_path / "photos" / "a.jpg")
+    table = write_table(tmp_path / "t.csv", [], [])
+    with pytest.raises(CaptureError, match="no image is listed in the table"):
+        import_images(tmp_path / "photos", tmp_path / "PLACE", split="map", table=table, camera=CAMERA)
+
+
 def test_names_that_are_not_utf8(tmp_path: Path) -> None:
     save(tmp_path / "photos" / "caf\u00e9.jpg")
     (tmp_path / "photos" / "m\udcfcller.jpg").write_bytes((tmp_path / "photos" / "caf\u00e9.jpg").read_bytes())

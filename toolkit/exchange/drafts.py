@@ -78,6 +78,7 @@ EXIF = "exif"
 MIN_INVERTIBLE = 0.9
 """Smallest share of the image in which the distortion of a usable camera can be inverted."""
 NOT_INSIDE = "not a path inside the folder of images"
+FROM_ELSEWHERE = "{} images have paths of another machine: their ends are in this folder"
 AXES = {"opencv": np.eye(4), "opengl": np.diag([1.0, -1.0, -1.0, 1.0])}
 """named_from_cam (4, 4) for each named convention of camera axes: `opencv`, the toolkit's own, has x right, y down, z
 forward; `opengl` has x right, y up, z backward."""
@@ -397,7 +398,8 @@ class Draft(Options):
                 self.sources[f"{image.name}.png"] = self.source(image.name)
                 image.name = f"{image.name}.png"
         if not self.images:
-            name, status = (self.rows[0]["image"], self.rows[0]["status"]) if self.rows else ("", "there is none")
+            listed = f"no image is listed{f' in {self.listed_in}' if self.listed_in else ''}"
+            name, status = (self.rows[0]["image"], self.rows[0]["status"]) if self.rows else ("none", listed)
             where = " Names are paths in this folder: correct them in the list, or put the list beside the images."
             where = f" {hint[0].upper()}{hint[1:]}." if hint else where
             name = printable(name)
@@ -407,10 +409,17 @@ class Draft(Options):
     def _match_names(self) -> str:
         """Give images whose file is missing the file that their name probably means. Return a note, or an empty text.
 
-        Equal names in another encoding (macOS decomposes letters) are taken; those that differ in case, extension
-        or separators with `match_names`, else only noted.
+        Ends of absolute paths and equal names in another encoding (macOS decomposes letters) are taken; those that
+        differ in case, extension or separators with `match_names`, else only noted.
         """
+        ends = {image.name: end for image in self.images if (end := end_below(self.folder, image.name)) is not None}
+        once = Counter([*ends.values(), *(image.name for image in self.images)])
+        ends = {name: end for name, end in ends.items() if once[end] == 1}
+        for image in self.images:
+            image.name = ends.get(image.name, image.name)
         missing = [image for image in self.images if not is_file(self.source(image.name))]
+        elsewhere = sum(not name.startswith("./") for name in ends)
+        self.notes += [FROM_ELSEWHERE.format(elsewhere)] if elsewhere else []
         if not missing or not self.folder.is_dir():
             return ""
         wanted = {image.name for image in self.images}
@@ -769,6 +778,14 @@ def write_png(source: Path, target: Path) -> None:
 def printable(name: str) -> str:
     """Return a name in which bytes that are not UTF-8 are replaced."""
     return name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+
+
+def end_below(folder: Path, name: str) -> str | None:
+    """Return the longest end of an absolute path, or what follows `./`, that is a file in a folder; None if none is."""
+    path = name.replace("\\", "/") if re.match(r"[A-Za-z]:", name) else name
+    parts = PurePosixPath(path).parts
+    first = 1 if re.match(r"/|[A-Za-z]:/", path) else 0 if path.startswith("./") else len(parts)
+    return next((end for at in range(first, len(parts)) if is_file(folder / (end := "/".join(parts[at:])))), None)
 
 
 def _composed(name: str) -> str:

@@ -32,7 +32,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from fnmatch import fnmatch
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -59,12 +59,14 @@ from toolkit.errors import COMMAND, CaptureError, ImageError, ManifestError
 from toolkit.exchange.colmap_model import NORM_TOLERANCE, inverse, read_cameras, read_model
 from toolkit.exchange.drafts import (
     AXES,
+    FROM_ELSEWHERE,
     HEIC_SUFFIXES,
     IMAGE_SUFFIXES,
     READ_SUFFIXES,
     SUBSESSION,
     Draft,
     DraftImage,
+    end_below,
     every_nth,
     heic_is_read,
     list_images,
@@ -547,7 +549,7 @@ def import_transforms(
     elif held and split == "map":
         draft.notes.append(f"val_filenames and test_filenames ({len(held)} images) of the file are not used")
     if found := sum(frame.from_elsewhere for frame in frames.values()):
-        draft.notes.append(f"{found} images have paths of another machine: their ends are in this folder")
+        draft.notes.append(FROM_ELSEWHERE.format(found))
     turn, scale = applied
     if not (np.array_equal(turn, np.eye(4)) and scale == 1):
         world = "that of the file's input" if undo_applied else "the file's, turned from that of its input"
@@ -614,13 +616,9 @@ class _TransformsFrame:
 
     def _with_suffix(self, image: str) -> str:
         """Return an image's path relative to the folder of the file, with its extension added if it is missing."""
-        is_absolute = re.match(r"/|[A-Za-z]:/", image) is not None
         name = os.path.normpath(os.path.relpath(image, self.path.parent) if image.startswith("/") else image)
-        parts = PurePosixPath(image).parts
-        if is_absolute and not is_file(self.path.parent / name):  # of another machine
-            tails = ("/".join(parts[start:]) for start in range(1, len(parts)))
-            tail = next((tail for tail in tails if is_file(self.path.parent / tail)), None)
-            self.from_elsewhere, name = tail is not None, tail or name
+        if not is_file(self.path.parent / name) and (end := end_below(self.path.parent, image)) is not None:
+            self.from_elsewhere, name = True, end  # a path of another machine
         suffixes = ["", *IMAGE_SUFFIXES, *map(str.upper, IMAGE_SUFFIXES)]
         name = next((name + suffix for suffix in suffixes if is_file(self.path.parent / (name + suffix))), name)
         return Path(name).as_posix()

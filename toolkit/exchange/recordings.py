@@ -69,10 +69,13 @@ def lines_of(path: Path) -> Iterator[tuple[str, list[str]]]:
 def read_csv(path: Path) -> pd.DataFrame:
     """Read a CSV table with a header, all values as text, with the additional column `line`.
 
-    Empty values beyond its columns, which spreadsheets write, are ignored. Raise CaptureError if the file cannot be
-    read, or a line has other columns than the header.
+    Columns are separated by commas, or as the header: by semicolons or tabs. Empty values beyond its columns, which
+    spreadsheets write, are ignored. Raise CaptureError if the file cannot be read, or a line has other columns than the
+    header.
     """
-    reader = csv.reader(io.StringIO(read_text(path)), skipinitialspace=True, strict=True)
+    text = read_text(path)
+    separator = next((one for one in ",;\t" if one in text.partition("\n")[0]), ",")
+    reader = csv.reader(io.StringIO(text), delimiter=separator, skipinitialspace=True, strict=True)
     rows: list[list[str | int]] = []
     try:
         header = next(reader, [])
