@@ -69,7 +69,7 @@ LIMITS = (0.5, 5.0)  # meters, degrees: a pose within them is correct
 MARGIN = 1.5  # factor on stated deviations, which are right only to about as much
 
 # Of the search for the pose
-PNP_FORMAT = 9
+PNP_FORMAT = 10
 """Version of the poses. Increase when the same settings and files give other poses, or they are written otherwise."""
 FIRST_REFERENCES = {2: 200, 4: 100}
 """Number of references per image to match first -> independent inliers that their pose needs to be kept. The next
