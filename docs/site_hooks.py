@@ -30,6 +30,8 @@ ELSEWHERE = {
 """Pages of the site whose files are not in docs/: where the site has them, where the repository."""
 DRAWER = {"76.25em": "68.75em", "76.234375em": "68.734375em"}
 """The width below which the theme folds its navigation away, 1,220 px, and what it becomes, 1,100 px."""
+OPTION = re.compile(r"(?<![\w-])--?[a-z][\w-]*(?![^<]*>)")
+"""An option in the HTML of code, but nothing in its tags."""
 SETTINGS = "<!-- all settings -->"
 """What the tables of all settings take the place of."""
 END = "...\n"  # of a YAML document that is a plain value
@@ -65,6 +67,12 @@ def on_page_markdown(markdown: str, page: "Page", **_: Any) -> str:
     text = re.sub(r"^(```\w+) \w+$", r"\1", text, flags=re.MULTILINE)
     text = "".join(part if part.startswith("```") else apart(part) for part in re.split(r"(?ms)(^```.*?^```$)", text))
     return text.replace(SETTINGS, "\n".join(settings_tables())) if SETTINGS in text else text
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Keep options such as `--hold-out` in one line; browsers would break it after each hyphen."""
+    kept = r'<span class="option">\g<0></span>'
+    return re.sub(r"(?s)<code>.*?</code>", lambda found: OPTION.sub(kept, found[0]), html)
 
 
 def on_post_build(config: "MkDocsConfig") -> None:
