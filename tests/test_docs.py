@@ -198,6 +198,10 @@ def test_the_page_of_settings_has_all_of_them() -> None:
     expected = {f"{stage}.{key}" for stage in STAGES for key in keys_of(type(Manifest.defaults(stage)))}
     assert expected <= {name for name, _ in named}
     assert len(named) == len({name for name, _ in named})
+    text = "\n".join(site_hooks.settings_tables())
+    assert "its sessions are `<key>_map` and `<key>_query`" in text, "Markdown shows &lt; in code as it stands"
+    assert "cuda:&lt;number> or mps" in text
+    assert not re.search("^ ", text, re.MULTILINE), "an indented paragraph is a block of code"
 
 
 def test_what_a_page_fetches_from_elsewhere_is_found() -> None:
