@@ -4,6 +4,7 @@ Pages that lie elsewhere in the repository, links to them, tables of all setting
 asks another machine for anything.
 """
 
+import inspect
 import posixpath
 import re
 from collections.abc import Iterator
@@ -30,6 +31,8 @@ ELSEWHERE = {
 """Pages of the site whose files are not in docs/: where the site has them, where the repository."""
 DRAWER = {"76.25em": "68.75em", "76.234375em": "68.734375em"}
 """The width below which the theme folds its navigation away, 1,220 px, and what it becomes, 1,100 px."""
+OPTION = re.compile(r"(?<![\w-])--?[a-zA-Z][\w-]*(?![^<]*>)")
+"""An option in the HTML of code, but nothing in its tags."""
 SETTINGS = "<!-- all settings -->"
 """What the tables of all settings take the place of."""
 END = "...\n"  # of a YAML document that is a plain value
@@ -65,6 +68,12 @@ def on_page_markdown(markdown: str, page: "Page", **_: Any) -> str:
     text = re.sub(r"^(```\w+) \w+$", r"\1", text, flags=re.MULTILINE)
     text = "".join(part if part.startswith("```") else apart(part) for part in re.split(r"(?ms)(^```.*?^```$)", text))
     return text.replace(SETTINGS, "\n".join(settings_tables())) if SETTINGS in text else text
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Keep options such as `--hold-out` in one line; browsers would break it after each hyphen."""
+    kept = r'<span class="option">\g<0></span>'
+    return re.sub(r"(?s)<code>.*?</code>", lambda found: OPTION.sub(kept, found[0]), html)
 
 
 def on_post_build(config: "MkDocsConfig") -> None:
@@ -123,13 +132,13 @@ def formula(source: str, *_: Any, **__: Any) -> str:
 
 def settings_tables() -> Iterator[str]:
     """Yield Markdown of all settings: a heading and a table for each section of the manifest's tree."""
-    yield from _tables("Of the manifest", Manifest, "", leave_out=STAGES)
+    yield from _tables("Manifest", Manifest, "", leave_out=STAGES)
     for stage in STAGES:
         yield from _tables(f"`{stage}`", type(Manifest.defaults(stage)), f"{stage}.")
 
 
 def _tables(title: str, model: type[Settings], prefix: str, leave_out: tuple[str, ...] = ()) -> Iterator[str]:
-    about = (model.__doc__ or "").strip()
+    about = inspect.cleandoc(model.__doc__ or "")
     level = "##" if prefix.count(".") < 2 else "###"
     yield from (f"\n{level} {title}\n", f"{about}\n", "| setting | default | what |", "|---|---|---|")
     inner = []
@@ -149,7 +158,8 @@ def _tables(title: str, model: type[Settings], prefix: str, leave_out: tuple[str
         else:
             default = yaml.safe_dump(field.get_default(), default_flow_style=True, width=1000)
             default = f"`{default.removesuffix(END).strip()}`"
-        meaning = " ".join((field.description or "").split()).replace("|", "\\|").replace("<", "&lt;")
+        meaning = " ".join((field.description or "").split()).replace("|", "\\|")
+        meaning = re.sub(r"`[^`]*`|<", lambda found: "&lt;" if found[0] == "<" else found[0], meaning)
         yield f"| `{prefix}{name}` | {default} | {meaning} |"
     for name, section in inner:
         yield from _tables(f"`{prefix}{name}`", section, f"{prefix}{name}.")

@@ -177,6 +177,17 @@ def test_lists_stand_apart_from_paragraphs() -> None:
         assert site_hooks.apart(same) == same
 
 
+def test_options_stay_in_one_line() -> None:
+    def kept(option: str) -> str:
+        return f'<span class="option">{option}</span>'
+
+    assert site_hooks.on_page_content("<code>a --hold-out 8</code>") == f"<code>a {kept('--hold-out')} 8</code>"
+    block = '<code><a id="x--y-1"></a>python<span class="w"> </span>-m<span class="w"> </span>toolkit a-b\n--x</code>'
+    expected = block.replace("-m<", f"{kept('-m')}<").replace("\n--x", f"\n{kept('--x')}")
+    assert site_hooks.on_page_content(block) == expected
+    assert site_hooks.on_page_content("<p>--x</p>") == "<p>--x</p>"
+
+
 def test_the_page_of_settings_has_all_of_them() -> None:
     assert site_hooks.SETTINGS in (ROOT / "docs" / "settings.md").read_text()
     rows = [line for line in site_hooks.settings_tables() if line.startswith("| `")]
@@ -187,6 +198,10 @@ def test_the_page_of_settings_has_all_of_them() -> None:
     expected = {f"{stage}.{key}" for stage in STAGES for key in keys_of(type(Manifest.defaults(stage)))}
     assert expected <= {name for name, _ in named}
     assert len(named) == len({name for name, _ in named})
+    text = "\n".join(site_hooks.settings_tables())
+    assert "its sessions are `<key>_map` and `<key>_query`" in text, "Markdown shows &lt; in code as it stands"
+    assert "cuda:&lt;number> or mps" in text
+    assert not re.search("^ ", text, re.MULTILINE), "an indented paragraph is a block of code"
 
 
 def test_what_a_page_fetches_from_elsewhere_is_found() -> None:
