@@ -152,38 +152,6 @@ def test_what_the_first_attempt_knew_of_rivals_is_judged_by_all_features() -> No
     assert [(prior.world_from_rig[0, 3], prior.images.tolist()) for prior in further.priors] == [(0, [0, 1]), (28, [5])]
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "support", "status"),
-    [
-        (0.9, 0.6, 0.72, "low_confidence"),
-        (0.8, 0.6, 2 / (1 / 0.8 + 1 / 0.6), "ok"),
-        (0.9, 0.2, 2 / (1 / 0.9 + 1 / 0.2), "ok"),
-        (0.3, 0.6, 0.6, "ok"),
-        (None, 0.6, 0.6, "ok"),
-        (0.9, None, 0.0, "ok"),
-    ],
-)
-def test_a_rival_that_both_attempts_found_has_the_mean_odds(
-    before: float | None, after: float | None, support: float, status: str
-) -> None:
-    """Of rooms that are copies, fallback features called 19 poses ok that SIFT had not, and 5 of them were wrong."""
-    scene, there = Scene(), np.eye(4)
-    there[0, 3] = 28.0
-    first, second = (replace(one, p_correct=1.0, rivals=() if rival is None else (Rival(there, rival),))
-                     for one, rival in ((LOW, before), (OK, after)))  # fmt: skip
-    extractor = SimpleNamespace(extract=lambda images: [scene.features[scene.names[0]]] * len(images), color=False)
-    further, kind = Scripted(second), SimpleNamespace(name="sift", extractor=extractor)
-    query = with_pixels(scene.query)
-    result = scripted_map(Scripted(first), further, [kind]).locate(query, references=scene.references)
-    assert sum(rival.support for rival in result.rivals) == pytest.approx(support)
-    assert result.status == status
-    # The other pose won: the first attempt's support for it is relative to that.
-    further.answers = [replace(second, world_from_rig=there, rivals=(Rival(np.eye(4), 0.6),))]
-    first = replace(first, rivals=(Rival(there, 0.9),))
-    result = scripted_map(Scripted(first), further, [kind]).locate(query, references=scene.references)
-    assert (result.rivals[0].support, result.status) == (pytest.approx(2 / (1 + 1 / 0.6)), "low_confidence")
-
-
 @pytest.mark.parametrize("lacks", ["references", "readable image"])
 def test_a_query_that_nothing_can_help_is_not_asked_again(lacks: str) -> None:
     scene = Scene()

@@ -342,9 +342,10 @@ class MapMatcher:
 
     def kind_names(self, points: Ints) -> NDArray[np.str_]:
         """Return the name of the kind of features of each point."""
-        return np.array([features.name for features in self.mapped])[self._kind_of(points)]
+        return np.array([features.name for features in self.mapped])[self.kind_of(points)]
 
-    def _kind_of(self, points: Ints) -> Ints:
+    def kind_of(self, points: Ints) -> Ints:
+        """Return the index of the kind of features of each point."""
         return np.searchsorted(self._first_point, points, side="right") - 1
 
     def keypoints(self, image: int, points: Ints) -> tuple[Ints, Floats]:
@@ -354,7 +355,7 @@ class MapMatcher:
         at = np.flatnonzero(np.isin(points, seen))  # `points` may repeat a point that several cameras of a rig see
         observation = first[np.searchsorted(seen, points[at])]
         pixels = np.zeros((len(at), 2))
-        kinds = self._kind_of(points[at])
+        kinds = self.kind_of(points[at])
         for kind in np.unique(kinds):
             seen_by = self.mapped[kind].image(self._of_kind(int(kind), [image])[0])
             pixels[kinds == kind] = seen_by.keypoints[keypoint[observation[kinds == kind]]]

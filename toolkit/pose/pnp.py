@@ -104,6 +104,8 @@ MAX_GUIDED_MATCHES = 1000
 RIVAL_SHARE = 0.25
 """Smallest number of matches by descriptors that agree with a rival, as a share of those that agree with the pose. Such
 a rival may have most of the guided matches, as references of one place hide those of its double."""
+KIND_SHARE = 0.25
+"""A kind of features with more than this share of the support of a pose judges its rivals alone, too."""
 GUIDED_WEIGHT = 0.5
 """Weight in the covariance of a match that only the search near the pose found. Errors over stated deviations then have
 medians of 0.7 (drone), 0.9, 1.4 (kitchen) and 1.0 (STRECHA); with 0: 0.2, 0.9, 1.1, 0.8; with 1: 0.9, 1.0, 1.6, 1.2."""
@@ -179,6 +181,8 @@ class _Hypothesis:
     matches: Matches
     support: float
     """How well the matches fit, see `_support`."""
+    supports: tuple[float, ...] = ()
+    """The same for the matches of each kind of features."""
 
     @property
     def world_from_rig(self) -> Floats:
@@ -479,7 +483,10 @@ class PnpLocalizer(Localizer):
             if len(guided) < min_matches:
                 break
             pose, inliers = query.refine(refined, guided, self.map.points, close=True), guided
-        return _Hypothesis(pose, inliers, _support(self._errors(query, pose, inliers), settings.max_error_deg))
+        errors, kinds = self._errors(query, pose, inliers), self.matcher.kind_of(inliers.point)
+        of_kinds = [errors[kinds == kind] for kind in range(len(self.matcher.mapped))]
+        support, *supports = [_support(part, settings.max_error_deg) for part in (errors, *of_kinds)]
+        return _Hypothesis(pose, inliers, support, tuple(supports))
 
     def _estimate(
         self, query: RigQuery, matches: Matches, hypotheses: list[_Hypothesis], references: Sequence[References]
@@ -591,8 +598,7 @@ class PnpLocalizer(Localizer):
         for other in hypotheses[1:]:
             if not any(agree(one.world_from_rig, other.world_from_rig, distance) for one in kept):
                 kept.append(other)
-        support = max(hypotheses[0].support, np.finfo(float).tiny)
-        return [Rival(other.world_from_rig, other.support / support) for other in kept[1:]]
+        return [Rival(other.world_from_rig, _relative_support(other, kept[0])) for other in kept[1:]]
 
     def _spread(self, hypotheses: list[_Hypothesis]) -> Floats:
         """Return the covariance (6, 6) due to poses with similar support that are too near to the best to be rivals."""
@@ -616,6 +622,17 @@ def _support(errors_deg: Floats, max_error_deg: float) -> float:
     """
     sums = [np.maximum(1 - (errors_deg / limit) ** 2, 0).sum() for limit in (max_error_deg, CLOSE * max_error_deg)]
     return float(np.sqrt(np.prod(sums)) * max(1 - 3 / max(len(errors_deg), 1), 0))
+
+
+def _relative_support(other: _Hypothesis, best: _Hypothesis) -> float:
+    """Return the support of a hypothesis, divided by that of the best: by all matches, or by the kind that doubts most.
+
+    Kinds of features see the same surfaces, so those that agree are no independent witnesses, and one that can tell two
+    places less well than all together has found a reason to doubt them.
+    """
+    kinds = zip(other.supports, best.supports, strict=True)
+    shares = [theirs / own for theirs, own in kinds if own > KIND_SHARE * best.support]
+    return max([other.support / max(best.support, np.finfo(float).tiny), *shares])
 
 
 def _best_first(hypotheses: Sequence[_Hypothesis]) -> list[_Hypothesis]:

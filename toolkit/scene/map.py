@@ -49,7 +49,6 @@ from toolkit.pose.base import (
     QueryMatches,
     QueryResult,
     References,
-    Rival,
     RoughPose,
     Status,
     View,
@@ -57,7 +56,7 @@ from toolkit.pose.base import (
 )  # fmt: skip
 from toolkit.pose.local_triangulation import OnDemandLocalizer, PosedImages
 from toolkit.pose.map_matching import MappedFeatures
-from toolkit.pose.pnp import MAX_RIVAL_SUPPORT, RIVAL_DISTANCE, PnpLocalizer, bounded_by_rivals
+from toolkit.pose.pnp import RIVAL_DISTANCE, PnpLocalizer, bounded_by_rivals
 from toolkit.prediction.feed_forward import FeedForwardLocalizer, depth_of_images
 from toolkit.prediction.hybrid import HybridLocalizer, LiftingLocalizer, lifts
 from toolkit.prediction.interface import Predictor
@@ -429,7 +428,8 @@ class Map:
         matches = self.match(query, references, self.fallback)
         result = self.solve(query, matches, None, [*priors, *known_priors], self.fallback)
         result = replace(result, found_by="+".join([result.found_by, *(kind.name for kind in self.escalation)]))
-        result = self._with_rivals_of(first, result)
+        if first.status is Status.OK:
+            result = self._with_rivals_of(first, result)
         better = result.status.rank >= max(first.status.rank, 1)
         earlier = first.first_seconds
         return replace(
@@ -441,37 +441,16 @@ class Map:
         )
 
     def _with_rivals_of(self, first: QueryResult, result: QueryResult) -> QueryResult:
-        """Return a result whose rivals keep the support that the first result gives them, as far as it counts.
-
-        Both results judge by matches of the same images, so their odds are not independent: a rival of both has the
-        geometric mean of its odds (the logarithmic opinion pool of Genest and Zidek, Statistical Science 1986), or
-        those of the result if they are higher. Few references may not show the place of a rival of an `ok` first
-        result: then it has the odds of that.
-        """
-        if result.world_from_rig is None or first.world_from_rig is None:
+        """Return a result that also has the rivals of an `ok` first one, whose places few references may not show."""
+        poses = [result.world_from_rig, *(rival.world_from_rig for rival in result.rivals)]
+        forgotten = [rival for rival in first.rivals if all(self._differ(rival.world_from_rig, pose) for pose in poses)]
+        if not forgotten or result.world_from_rig is None:
             return result
-        known = [Rival(first.world_from_rig, 1.0), *first.rivals]
-
-        def support_of(world_from_rig: Floats) -> float:
-            """Return the support of a pose in the first result, NaN if it is not among its poses."""
-            return next((one.support for one in known if not self._differ(one.world_from_rig, world_from_rig)), np.nan)
-
-        own, rivals = support_of(result.world_from_rig) or np.nan, list[Rival]()
-        for rival in result.rivals:
-            relative = min(support_of(rival.world_from_rig) / own, 1.0)
-            pooled = 2 / (1 / relative + 1 / rival.support) if relative > 0 < rival.support else 0.0
-            rivals.append(rival._replace(support=max(rival.support, pooled)))
-        if first.status is Status.OK:
-            poses = [result.world_from_rig, *(rival.world_from_rig for rival in rivals)]
-            rivals += [one for one in first.rivals if all(self._differ(one.world_from_rig, pose) for pose in poses)]
-        if not rivals:
-            return result
-        rivals.sort(key=lambda rival: -rival.support)
+        rivals = sorted([*result.rivals, *forgotten], key=lambda rival: -rival.support)
         probability = bounded_by_rivals(result.p_correct, [rival.support for rival in rivals])
-        unsure = probability < self.settings.pnp.ok_probability or rivals[0].support > MAX_RIVAL_SUPPORT
         return replace(
             result,
-            status=Status.LOW_CONFIDENCE if unsure else result.status,
+            status=Status.LOW_CONFIDENCE if probability < self.settings.pnp.ok_probability else result.status,
             p_correct=probability,
             rivals=tuple(rivals),
             rival_support=rivals[0].support,
