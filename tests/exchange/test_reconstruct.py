@@ -120,7 +120,7 @@ def test_known_cameras_and_rough_poses(photographs: Path, small_capture: Path, t
     rows = [",".join(map(str, (name, *qt))) for name, qt in zip(names, qt_from_pose(rough), strict=True)]
     prior.write_text("\n".join(["image,qw,qx,qy,qz,tx,ty,tz", *rows]))
     result = reconstruct([photographs], tmp_path / "PLACE", table=table, poses_prior=prior, axes="opengl")
-    capture = Capture.open(tmp_path / "PLACE")
+    capture = result.capture
     found = capture["ios_map"]
     assert capture.unit == "m"
     assert camera_text(found.camera(found.images["sensor_id"].iloc[0])) == camera_text(camera)

@@ -26,7 +26,7 @@ import pycolmap
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from toolkit.capture import Session, parse_camera
+from toolkit.capture import Capture, Session, parse_camera
 from toolkit.capture.images import camera_text, default_workers, exif_key, prefetch, read_header
 from toolkit.capture.names import is_linked_here, note_linked_here
 from toolkit.capture.session import RAW_DATA
@@ -95,6 +95,11 @@ class Reconstruction:
     points: Floats  # (P, 3) in the world
     colors: NDArray[np.uint8]  # (P, 3) RGB
     camera: str = ""  # option for queries of the same camera, if the photographs have one
+
+    @property
+    def capture(self) -> Capture:
+        """The capture with the new sessions."""
+        return Capture.open(self.report.session.parents[1])
 
 
 class _Mutual(MutualMatcher):
