@@ -233,9 +233,10 @@ def test_bad_cameras_are_rows(tmp_path: Path) -> None:
     cameras = (
         "1 PINHOLE 64 48 0 0 32 24\n2 PINHOLE 64 48 50 50 5000 24\n3 PINHOLE 64 48 nan 50 32 24\n4 NONE 64 48 1\n"
         f"5 RAD_TAN_THIN_PRISM_FISHEYE 64 48 {'50 ' * 14}\n6 PINHOLE 64 48 50 50 32 24\n"
+        "7 SIMPLE_PINHOLE 640 480 0.78 320 240\n8 PINHOLE 64 48 50 1e9 32 24\n"  # f / width, as OpenSfM's; overflow
     )
     model = read_model(write(tmp_path, images_txt(), cameras))
-    assert [number for number, camera in model.cameras.items() if isinstance(camera, str)] == [1, 2, 3, 4, 5]
+    assert [number for number, camera in model.cameras.items() if isinstance(camera, str)] == [1, 2, 3, 4, 5, 7, 8]
 
 
 def test_distortion_that_cannot_be_inverted_leaves_the_camera_out(tmp_path: Path, photos: Path) -> None:

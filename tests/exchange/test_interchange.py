@@ -150,7 +150,8 @@ def test_images_of_a_model_that_cannot_be_used_are_rows(model: Path, tmp_path: P
     report = import_colmap(model, photos, tmp_path / "PLACE")
     status = report.images.set_index("image")["status"]
     assert status["phone/1.jpg"] == "no such file"
-    assert status["phone/2.jpg"].startswith("cannot be read as an image")
+    assert status["phone/2.jpg"] == "cannot be read as an image (of no known format, or damaged)"
+    assert report.record["poses"] == report.record["used"] == 1
     assert status["rig/3.jpg"].startswith("the image is stored as 32 x 24 pixels, its camera has 64 x 48; use")
     assert status["rig/4.jpg"].endswith("rotate the pixels and remove the EXIF orientation")
     assert status["rig/5.jpg"] == "imported"
@@ -487,7 +488,7 @@ def test_depth_and_masks_beside_photographs(tmp_path: Path) -> None:
         PIL.Image.fromarray((color[..., 0] * 255).astype(np.uint16)).save(photos / f"{k}.depth.png")
         PIL.Image.fromarray(np.uint8(255) * (color[..., 0] > 99).astype(np.uint8)).save(photos / "masks" / f"{k}.png")
     report = import_images(photos, tmp_path / "A", camera=CAMERA)
-    assert "have 16 bits or two values" in report.text()
+    assert "have 16 bits or few values" in report.text()
     for place, options in (("B", {"only": ["*.color.png"]}), ("C", {"skip": ["*.depth.png", "masks/*"]})):
         report = import_images(photos, tmp_path / place, camera=CAMERA, **options)
         assert list(report.images["image"]) == ["0.color.png", "1.color.png"]
@@ -495,6 +496,15 @@ def test_depth_and_masks_beside_photographs(tmp_path: Path) -> None:
         assert "4  by --only and --skip" in report.text()
     with pytest.raises(CaptureError, match="none of 6 images fits"):
         import_images(photos, tmp_path / "D", camera=CAMERA, only=["*.jpeg"])
+
+
+def test_depth_in_meters_and_confidence_beside_photographs(folder: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for k in range(3):
+        PIL.Image.fromarray(rng.random((48, 64), np.float32)).save(folder / f"{k}.tiff")
+        PIL.Image.fromarray(rng.integers(0, 3, (48, 64)).astype(np.uint8)).save(folder / f"{k}.confidence.png")
+    report = import_images(folder, tmp_path / "A", camera=CAMERA)
+    assert "have 16 bits or few values, like depth, confidence" in report.text()
 
 
 def test_a_capture_in_the_folder_of_photographs_is_skipped(folder: Path) -> None:

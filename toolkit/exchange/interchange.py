@@ -316,12 +316,12 @@ def _listed(draft: Draft, folder: Path, only: Sequence[str], skip: Sequence[str]
         raise CaptureError(f"{folder}: none of {len(names)} images fits the patterns {', '.join([*only, *skip])}.")
     if len(chosen) < len(names):
         draft.others["by --only and --skip"] = sorted({*names} - {*chosen})
-    pngs = [name for name in chosen if name.lower().endswith(".png")]
-    sample = pngs[:: max(1, len(pngs) // 40)]
+    exact = [name for name in chosen if not name.lower().endswith((".jpg", ".jpeg"))]
+    sample = exact[:: max(1, len(exact) // 40)]
     flat = [name for name in sample if _is_no_photograph(folder / name)]
-    if flat and len(flat) / len(sample) * len(pngs) >= 0.5 * len(chosen):
-        kinds = f"{len(flat)} of {len(sample)} PNG files that were looked at, such as {flat[0]}, have 16 bits or two"
-        draft.notes.append(f"{kinds} values, like depth and masks: leave such out with --only or --skip")
+    if flat and len(flat) / len(sample) * len(exact) >= 0.5 * len(chosen):
+        kinds = f"{len(flat)} of {len(sample)} files that were looked at, such as {flat[0]}, have 16 bits or few"
+        draft.notes.append(f"{kinds} values, like depth, confidence and masks: leave such out with --only or --skip")
     return chosen
 
 
@@ -330,12 +330,12 @@ def _fits(name: str, patterns: Sequence[str]) -> bool:
 
 
 def _is_no_photograph(path: Path) -> bool:
-    """Tell whether an image has 16 bits in one channel, or at most two values."""
+    """Tell whether an image has 16 bits or decimals in one channel, or at most 4 values (ARKit's confidence: 3)."""
     try:
         pixels = decode(path, cv2.IMREAD_UNCHANGED)
     except ImageError:
         return False
-    return (pixels.dtype == np.uint16 and pixels.ndim == 2) or len(np.unique(pixels[::2, ::2])) <= 2
+    return (pixels.dtype != np.uint8 and pixels.ndim == 2) or len(np.unique(pixels[::2, ::2])) <= 4
 
 
 def camera_at(where: object, params: str) -> pycolmap.Camera:
@@ -528,14 +528,21 @@ def import_transforms(
     own_split = own_split and bool(held) and split == "map" and not draft.hold_out
     frames: dict[str, _TransformsFrame] = {}
     applied = _applied(path, content)
+    again: dict[str, CaptureError] = {}
     for number, entry in enumerate(content["frames"]):
-        frame = _TransformsFrame(path, number, entry, content)
-        if frame.name in frames:
-            raise frame.error("file_path", f"that of frame {frames[frame.name].number} again", "one frame per image")
-        frames[frame.name] = frame
+        try:
+            frame = _TransformsFrame(path, number, entry, content)
+        except CaptureError as error:
+            draft.add_image(f"frame {number}", str(error), None, "")
+            continue
+        first = frames.setdefault(frame.name, frame)
+        if frame.values != first.values:
+            again[frame.name] = frame.error("file_path", f"that of frame {first.number} again", "one frame per image")
     trained = _named(content, "train_filenames") or {frame.listed for frame in frames.values()} - held
     for name, frame in sorted(frames.items()):
         try:
+            if name in again:
+                raise again[name]
             if own_split and frame.listed not in held | trained:
                 raise CaptureError("it is in none of train_filenames, val_filenames and test_filenames")
             pose = frame.world_from_named()
@@ -566,7 +573,7 @@ def _read_transforms(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         raise CaptureError(f"{path}: cannot be read ({error}). {expected}") from None
     frames = content.get("frames") if isinstance(content, dict) else None
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+    if not isinstance(frames, list) or not any(isinstance(frame, dict) for frame in frames):
         found = f"keys {', '.join(map(repr, content))[:100]}" if isinstance(content, dict) else repr(content)[:100]
         raise CaptureError(f"{path}: frames: found {found or 'nothing'}, no list of frames. {expected}")
     assert isinstance(content, dict)
@@ -606,7 +613,8 @@ def _undone(pose: Floats, applied: Floats, scale: float) -> Floats:
 class _TransformsFrame:
     """One image of the file. Its own values override those at the top level."""
 
-    def __init__(self, path: Path, number: int, entry: Mapping[str, Any], shared: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, number: int, entry: object, shared: Mapping[str, Any]) -> None:
+        entry = entry if isinstance(entry, dict) else {}
         self.path, self.number, self.values = path, number, {**shared, **entry}
         image = entry.get("file_path")
         if not isinstance(image, str) or not image.strip() or re.search("[\ud800-\udfff]", image):

@@ -14,7 +14,15 @@ import pycolmap
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from toolkit.capture.images import HEADER_ERRORS, camera_text, exif_camera, exif_key, find_mask, read_header
+from toolkit.capture.images import (
+    HEADER_ERRORS,
+    camera_text,
+    exif_camera,
+    exif_key,
+    find_mask,
+    not_an_image,
+    read_header,
+)  # fmt: skip
 from toolkit.errors import CaptureError, ImageError
 from toolkit.exchange.drafts import (
     CONVERTED_SUFFIXES,
@@ -118,7 +126,7 @@ def _converted(name: str, path: Path, made: Path) -> tuple[str, Path]:
             with write_atomic(target) as temporary:
                 write_png(path, temporary)
         except HEADER_ERRORS as error:
-            raise ImageError(f"cannot be read as an image ({error})") from None
+            raise not_an_image(error) from None
     return f"{name}.png", target
 
 
