@@ -151,7 +151,8 @@ class QueryResult:
     rmse_px: float = float("nan")
     rival_support: float = 0.0
     """Support of the best clearly different pose (beyond 2.5 degrees or 0.25 m), divided by that of this pose; 0 if
-    there is none. A guided match supports a pose by 1 - (error / `max_error_deg`)^2, at least 0."""
+    there is none. A guided match supports a pose by 1 - (error / `max_error_deg`)^2, at least 0. Of all matches and
+    each kind of features with a quarter of the support, the largest ratio counts."""
     rivals: tuple[Rival, ...] = ()
     """Clearly different poses that some matches support, best supported first."""
     coverage: float = 0.0
