@@ -395,10 +395,6 @@ def parse_camera(sensor_type: str, params: str) -> pycolmap.Camera:
     camera = pycolmap.Camera(model=model, width=int(width), height=int(height), params=numbers[2:])
     if any(camera.params[index] <= 0 for index in camera.focal_length_idxs()):
         raise ValueError(f"found a focal length that is not positive in {params!r}, expected pixels.")
-    for focal_px in (camera.params[index] for index in camera.focal_length_idxs()):
-        if not 0.01 <= focal_px / max(width, height) <= 1000:
-            found = f"found a focal length of {focal_px:g} pixels in {params!r}"
-            raise ValueError(f"{found}, which no lens has; is it in millimeters, or relative to the image's size?")
     for index, size in zip(camera.principal_point_idxs(), (width, height), strict=False):
         if not -size <= camera.params[index] <= 2 * size:
             found = f"found a principal point at {camera.params[index]:g} in {params!r}"

@@ -77,6 +77,8 @@ EXIF = "exif"
 """What is given for a table of GPS fixes if the images have them."""
 MIN_INVERTIBLE = 0.9
 """Smallest share of the image in which the distortion of a usable camera can be inverted."""
+MIN_FOCAL, MAX_FOCAL = 0.01, 1000
+"""Focal lengths outside of these multiples of the image's longer side are of no lens, but in another unit."""
 NOT_INSIDE = "not a path inside the folder of images"
 FROM_ELSEWHERE = "{} images have paths of another machine: their ends are in this folder"
 AXES = {"opencv": np.eye(4), "opengl": np.diag([1.0, -1.0, -1.0, 1.0])}
@@ -385,6 +387,9 @@ class Draft(Options):
         cameras = {image.sensor: image.camera for image in self.images}
         share = {sensor: invertible_share(camera) for sensor, camera in cameras.items()}
         for image in self.images:
+            focal = image.camera.mean_focal_length() / max(image.camera.width, image.camera.height)
+            if not MIN_FOCAL <= focal <= MAX_FOCAL and not problems[image.name]:
+                problems[image.name] = f"its focal length is {focal:.2g} times the image's size: is it in pixels?"
             if share[image.sensor] < MIN_INVERTIBLE and not problems[image.name]:
                 percent = f"{100 * (1 - share[image.sensor]):.0f} %"
                 problems[image.name] = f"the distortion of its camera cannot be inverted in {percent} of the image"
