@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 
 from toolkit.errors import CaptureError, ManifestError
-from toolkit.exchange.georeference import GPS, Placing, east_north_up, fit, place, read_positions
+from toolkit.exchange.georeference import GPS, Placing, drift_factor, east_north_up, fit, place, read_positions
 from toolkit.geometry import Floats, quaternion_to_rotation, unit
 
 SCALE = 3.7  # meters per unit of the models
@@ -110,6 +110,17 @@ def test_too_few_or_too_close_positions_give_no_meters() -> None:
     rng = np.random.default_rng(0)
     noise = {name: rng.normal(size=3) * 3 for name in centers(model)}
     assert placed(synthetic(), {}, positions=noise).unit is None
+
+
+def test_drift_of_rough_poses_is_no_independent_noise() -> None:
+    rng = np.random.default_rng(0)
+    noise = 0.05 * rng.normal(size=(400, 3))
+    assert drift_factor(noise, 0.1) < 1.2
+    drift = np.zeros_like(noise)
+    for row in range(1, len(noise)):
+        drift[row] = 0.9 * drift[row - 1] + np.sqrt(1 - 0.9**2) * noise[row]
+    assert 3 < drift_factor(drift, 0.1) < 5.5  # sqrt(1.9 / 0.1) = 4.4
+    assert drift_factor(np.zeros((1, 3)), 0.1) == 1
 
 
 def test_level_by_the_cameras() -> None:

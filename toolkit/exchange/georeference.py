@@ -112,8 +112,8 @@ def _place_by_poses(
     record: dict[str, Any],
 ) -> Placing:  # fmt: skip
     """Transform a model to the world of rough poses; orientations tell up, also where positions are on a line."""
-    names = sorted(name for name in images if name in prior)
-    names = names[:: -(-len(names) // MOST_ALIGNED) or 1]
+    every = sorted(name for name in images if name in prior)
+    names = every[:: -(-len(every) // MOST_ALIGNED) or 1]
     if not names:
         return Placing(None, record, [f"{PRIOR}: none of a photograph in the model"])
     ours = np.stack([_upright(images[name], 0) for name in names])
@@ -126,7 +126,20 @@ def _place_by_poses(
     model.transform(pycolmap.Sim3d(by.scale, pycolmap.Rotation3d(by.rotation), by.translation))
     record |= {"meters": PRIOR, "residual_m": found.rmse_m, "scale deviation": found.scale_std, "up": f"by {PRIOR}"}
     note = f"meters and world: from {PRIOR}, {facts}"
-    return Placing("m", record, [note], found.center_noise_m / np.sqrt(3))
+    errors = np.array([images[name].projection_center() - prior[name][:3, 3] for name in every])
+    return Placing("m", record, [note], found.center_noise_m / np.sqrt(3) * drift_factor(errors, found.center_noise_m))
+
+
+def drift_factor(errors: Floats, noise_m: float) -> float:
+    """Return by how much the noise of positions counts more, as errors (N, 3), meters, are like those of neighbors.
+
+    Tracking drifts, and positions with equal errors tell no more than one of them. If neighbors have the correlation r
+    (first-order autoregression), the variance of a mean is (1 + r) / (1 - r) times that of independent errors. Errors
+    above 3 times `noise_m` are outliers.
+    """
+    errors = errors[np.linalg.norm(errors, axis=1) <= 3 * noise_m]
+    r = np.clip((errors[1:] * errors[:-1]).sum() / max((errors**2).sum(), 1e-12), 0, 0.99)
+    return float(np.sqrt((1 + r) / (1 - r)))
 
 
 def alignment(
