@@ -52,9 +52,6 @@ NO_FILE = "no such file"
 EXIF_CAMERA = (0x010F, 0x0110, _FOCAL_MM, _FOCAL_35MM)
 """EXIF tags that distinguish cameras: make, model and focal lengths."""
 _FILM_DIAGONAL_MM = float(np.hypot(36, 24))
-_MIN_SENSOR_MM = 4.0
-"""Longer side of the smallest sensors of cameras that write FocalPlaneXResolution. A smaller one in EXIF is that of an
-image that was resized by a program that wrote its new width there, and left the resolution."""
 CAMERA_TYPES = ("camera", "depth")  # sensor types with intrinsics; only `camera` takes photographs
 WIDE = ("FISHEYE", "FOV", "EUCM")  # ends of the names of models for fields of view of 180 degrees and more
 _LARGEST = 2**31 - 1  # largest image side, pixels; COLMAP cannot hold larger numbers
@@ -331,9 +328,9 @@ def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
     """Guess the intrinsics of an image from its EXIF tags: no distortion, principal point in the image center.
 
     FocalLengthIn35mmFilm refers to the diagonal of 36 mm x 24 mm film (CIPA DC-008). Without that tag, the focal length
-    is FocalLength times FocalPlaneXResolution, scaled if the image was resized later; tags that mean a sensor of less
-    than 4 mm contradict each other. An image whose sides have another ratio than in EXIF was cropped; the tags are
-    those of the whole image. Raise ImageError if the image cannot be read, or has no focal length in EXIF.
+    is FocalLength times FocalPlaneXResolution, scaled if the image was resized later. An image whose sides have another
+    ratio than in EXIF was cropped; the tags are those of the whole image. Raise ImageError if the image cannot be read,
+    or has no focal length in EXIF.
 
     Returns:
         A SIMPLE_PINHOLE camera, and a phrase that names the tags used.
@@ -345,19 +342,17 @@ def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
     sides = sorted([width, height])
     cropped = whole[0] > 0 and abs(whole[1] * sides[0] / (whole[0] * sides[1]) - 1) > 0.02
     cropped = cropped and sides[0] <= whole[0] and sides[1] <= whole[1]
-    stored = read_number(exif, _WIDTH) or width
-    resized = plane_x > 0 and unit_mm and stored / plane_x * unit_mm < _MIN_SENSOR_MM * width / max(sides)
     if film_mm > 0:
         diagonal = np.hypot(*(whole if cropped else sides))
         focal_px, how = film_mm * diagonal / _FILM_DIAGONAL_MM, "FocalLengthIn35mmFilm"
-    elif focal_mm > 0 and plane_x > 0 and unit_mm and not resized:
-        focal_px = focal_mm * plane_x / unit_mm * (1.0 if cropped else width / stored)
+    elif focal_mm > 0 and plane_x > 0 and unit_mm:
+        stored = read_number(exif, _WIDTH)
+        focal_px = focal_mm * plane_x / unit_mm * (width / stored if stored > 0 and not cropped else 1.0)
         how = "FocalLength and FocalPlaneXResolution"
     else:
         such_as = f"'SIMPLE_PINHOLE,{width},{height},FOCAL_PX,{width / 2:g},{height / 2:g}'"
         options = f"--camera 'MODEL,W,H,...', such as {such_as}, with --cameras, or in the table"
-        why = "the image was resized, not its FocalPlaneXResolution in EXIF" if resized else "no focal length in EXIF"
-        raise ImageError(f"{why}: give the intrinsics with {options}")
+        raise ImageError(f"no focal length in EXIF: give the intrinsics with {options}")
     how += " of the whole image, which was cropped" if cropped else ""
     params = [float(focal_px), width / 2, height / 2]
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
