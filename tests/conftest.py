@@ -5,6 +5,7 @@ What takes long to make is made once, also where pytest-xdist has several worker
 
 import gc
 import os
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,6 +24,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:
         os.environ.setdefault(name, "1")
 
 
+# jsonschema, which nbformat imports, would read the grammar of IRIs for more than a second; no notebook has an IRI.
+sys.modules["rfc3987_syntax"] = None  # type: ignore[assignment]
 gc.disable()  # while the tests are imported: what they import stays
 
 
