@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from tests.calls import call
 from tests.queries import likeness, session_query
 from toolkit.capture import Capture, Session
-from toolkit.files import SceneFiles
+from toolkit.files import SceneFiles, link_or_copy
 from toolkit.localize import localize_pairs
 from toolkit.manifest import PredictorSettings
 from toolkit.mapping.local_map import LocalMap
 from toolkit.pose.base import QueryInput
 from toolkit.prediction.feed_forward import FeedForwardLocalizer
 from toolkit.prediction.network import SimulatedPredictor
+from toolkit.runs.folder import LOG
 
 Floats = NDArray[np.float64]
 LIST = "keyframes_original"
@@ -52,6 +53,15 @@ class World:
 def copy_shared(folder: Path, to: Path) -> Path:
     """Copy a folder that other tests may be using at this moment, without the locks that come and go."""
     return Path(shutil.copytree(folder, to, ignore=shutil.ignore_patterns("*.lock")))
+
+
+def copy_linked(run: Path, to: Path) -> Path:
+    """Copy a run by hard links, so that nothing done there is done here; a log grows in place, so it is a copy."""
+    shutil.copytree(run, to, copy_function=link_or_copy)
+    (to / LOG).unlink(missing_ok=True)
+    if (run / LOG).exists():
+        shutil.copy(run / LOG, to / LOG)
+    return to
 
 
 def run_stage(

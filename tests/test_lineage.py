@@ -4,16 +4,12 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pandas as pd
-import papermill
 import pytest
 
+from tests.rendered import copy_linked
 from toolkit import notebook, pipeline
-from toolkit.capture import Capture
-from toolkit.capture.session import IMPORT_RECORD
 from toolkit.errors import COMMAND, ArtifactError, ManifestError
 from toolkit.evaluate import evaluate_scene
 from toolkit.exchange.export import export_colmap, export_matches, export_pairs, export_poses, geo_table
@@ -23,20 +19,14 @@ from toolkit.files import (
     SceneFiles,
     changed_sources,
     file_fingerprint,
-    link_or_copy,
-    map_record_path,
     older_files,
-    read_map_record,
     read_sidecar,
     require_current,
     why_older,
     write_sidecar,
 )
-from toolkit.localize import localize_image
-from toolkit.notebook import notebook_path
 from toolkit.report.comparison import compare_runs
 from toolkit.report.page import write_report
-from toolkit.results.pair import PairResults
 from toolkit.scene.map import Map
 from toolkit.scene.run import InspectedPair, Run
 from toolkit.store.items import Items
@@ -258,12 +248,8 @@ def change(files: SceneFiles, what: str) -> None:
 
 @pytest.fixture
 def linked(small_run: Path, tmp_path: Path) -> SceneFiles:
-    """The small run, by hard links, so that nothing done here is done there; a log grows in place, so it is a copy."""
-    shutil.copytree(small_run, tmp_path / small_run.name, copy_function=link_or_copy)
-    log = tmp_path / small_run.name / "run.log"
-    log.unlink()
-    shutil.copy(small_run / log.name, log)
-    return SceneFiles(tmp_path / small_run.name, "SMALL")
+    """The small run, by hard links."""
+    return SceneFiles(copy_linked(small_run, tmp_path / small_run.name), "SMALL")
 
 
 @pytest.mark.slow
@@ -329,108 +315,6 @@ def test_a_run_with_other_settings_leaves_the_finished_one_as_it_is(linked: Scen
     taken = SceneFiles(run, "SMALL")
     assert taken.retrieval("ios", "hl").samefile(linked.retrieval("ios", "hl"))
     assert "nearest" in taken.poses_csv("ios", "hl").read_text()
-
-
-NETWORK = {"name": "da3-small", "checkpoint": "$MADE/da3-small.safetensors", "num_references": 3}
-METHODS: dict[str, dict[str, Any]] = {
-    "pnp": {"method": "pnp", "pnp": {"max_error_deg": 0.4}},
-    "nearest": {"method": "nearest"},
-    "feed_forward": {"method": "feed_forward", "predictor": "simulated"},
-    "hybrid": {"method": "hybrid", "predictor": "simulated"},
-    "aliked": {"method": "pnp", "features": {"kinds": ["aliked"]}, "matcher": {"name": "mutual"}},
-    "aliked, lightglue": {"method": "pnp", "features": {"kinds": ["aliked"]}},
-    "sift and aliked": {"method": "pnp", "features": {"kinds": ["sift", "aliked"]}},
-    "superpoint": {
-        "method": "pnp", "features": {"kinds": ["superpoint"], "checkpoint": "$MADE/superpoint.safetensors"},
-        "matcher": {"name": "mutual"},
-    },
-    "superpoint, lightglue": {
-        "method": "pnp", "features": {
-            "kinds": ["superpoint"], "checkpoint": "$MADE/superpoint.safetensors", "superpoint": {"max_keypoints": 512},
-        },
-        "matcher": {"checkpoint": "$MADE/lightglue.safetensors"},
-    },
-    "a network, feed_forward": {"method": "feed_forward", "predictor": NETWORK},
-    "a network, hybrid": {"method": "hybrid", "predictor": NETWORK},
-}  # fmt: skip
-DOORS = [(name, "ios", "ios") for name in METHODS] + [
-    (name, "ios", "spot") for name in ("pnp", "hybrid", "aliked", "superpoint", "a network, hybrid")
-]
-
-
-@pytest.fixture
-def made_weights(made_once: Callable[[str, Callable[[Path], object]], Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    """$MADE is a folder with random weights of SuperPoint, its LightGlue and Depth Anything 3 Small."""
-    from safetensors.torch import save_file
-
-    from tests.features import test_lightglue, test_superpoint
-    from tests.golden import da3
-
-    def make(folder: Path) -> None:
-        states = {"superpoint": test_superpoint.random_state(), "lightglue": test_lightglue.random_state()}
-        states["da3-small"] = da3.state(da3.shapes("da3-small"))
-        for name, state in states.items():
-            save_file({key: value.clone() for key, value in state.items()}, folder / f"{name}.safetensors")
-
-    monkeypatch.setenv("MADE", str(made_once("weights", make)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "map_device", "query_device"), DOORS)
-def test_every_door_gives_the_same_poses(
-    linked: SceneFiles, small_capture: Path, tmp_path: Path, released_weights: None,
-    request: pytest.FixtureRequest, name: str, map_device: str, query_device: str,
-) -> None:  # fmt: skip
-    """A run, the notebook by hand, one image at a time and inspection, with a unit that the import did not know."""
-    method = METHODS[name]
-    if "aliked" in name:
-        request.getfixturevalue("learned_weights")
-    if "$MADE" in str(method):
-        request.getfixturevalue("made_weights")
-    manifest, devices = linked.run.parent / f"{linked.run.name}.yaml", (map_device, query_device)
-    capture = Path(shutil.copytree(small_capture, tmp_path / "copy" / small_capture.name))
-    for record in capture.glob("sessions/*"):
-        (record / IMPORT_RECORD).parent.mkdir(exist_ok=True)
-        (record / IMPORT_RECORD).write_text('{"unit": null}')
-    content = f"captures: ['{capture}']\noutput_root: .\npairs: [[{map_device}, {query_device}]]\n"
-    manifest.write_text(f"{content}localize: {json.dumps(method)}\n")
-    shutil.rmtree(linked.poses_dir)  # the other pairs would be of an older map
-    pipeline.run(manifest, only="embed,retrieve,localize", say=quiet, in_place=True)
-    path, run = linked.poses_txt(*devices), Run.open(linked.run)
-    record = map_record_path(linked.poses_dir, "SMALL", map_device)
-    results, unit = PairResults.open(path), read_map_record(record)["unit"]
-    assert len(results) == 2
-    assert unit is None
-    # by hand
-    nested = {key: value for key, value in method.items() if isinstance(value, dict)}
-    parameters = {key: value for key, value in method.items() if key not in nested} | {"settings": nested}
-    parameters |= dict(zip(("map_device", "query_device"), devices, strict=True))
-    folders = {key: str(tmp_path / key) for key in ("out_dir", "features_dir", "map_dir")}
-    folders |= {"sessions_root": str(capture / "sessions"), "retrieval_dir": str(linked.retrieval_dir)}
-    papermill.execute_notebook(notebook_path("localize"), None, parameters | folders, progress_bar=False)
-    assert (tmp_path / "out_dir" / path.name).read_bytes() == path.read_bytes()
-    by_run, by_hand = (pd.read_csv(one / f"{path.stem}.csv") for one in (linked.poses_dir, tmp_path / "out_dir"))
-    pd.testing.assert_frame_equal(*(one.filter(regex="^(?!(first_)?seconds$)") for one in (by_run, by_hand)))
-    assert read_map_record(map_record_path(tmp_path / "out_dir", "SMALL", map_device))["unit"] == unit
-    # one image, or the images of one rig, and inspection
-    place, session = run.map(map_device), Capture.open(capture)[f"{query_device}_query"]
-    assert place.settings.unit == unit
-    inspected = InspectedPair(*devices, linked.poses_dir)
-    for number, rows in enumerate(session.rows_of_keyframes(results.table)):
-        one = results[number]
-        if method.get("predictor") == "simulated":  # it predicts images of the capture only
-            found = place.locate(place.query_of_session(session, rows))
-        else:
-            paths = [session.image_path(row) for row in rows.tolist()]
-            found = localize_image(place, paths, session.cameras(rows), session.rig_from_cam(rows))
-        shown = inspected.look(number)
-        assert shown.result.status_text == found.status_text == one.status_text
-        assert shown.unit == results.unit
-        for other in (found, shown.result, shown.result.what_if().after.result):
-            if one.world_from_rig is None:
-                assert other.world_from_rig is None
-            else:
-                np.testing.assert_allclose(other.world_from_rig, one.world_from_rig, atol=1e-9)
 
 
 @pytest.mark.parametrize(

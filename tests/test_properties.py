@@ -42,7 +42,7 @@ from toolkit.results.pair import query_group
 from toolkit.store.hdf5 import write_groups
 from toolkit.store.items import Items
 
-settings.register_profile("quick", derandomize=True, database=None, deadline=None, max_examples=25)
+settings.register_profile("quick", derandomize=True, database=None, deadline=None, max_examples=10)
 settings.register_profile("thorough", derandomize=True, database=None, deadline=None, max_examples=100)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
 # A test that gets one folder for all of its examples overwrites what is in it.

@@ -106,6 +106,7 @@ def numbers(kernel: str) -> list[str]:
     return subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.splitlines()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(np.__config__.show("dicts")["Machine Information"]["host"]["cpu"] != "x86_64", reason="x86 kernels")
 def test_features_vocabulary_and_matches_are_the_same_for_every_kernel_and_number_of_threads() -> None:
     expected, *others = numbers("Haswell") + numbers("Prescott")

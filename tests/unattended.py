@@ -50,6 +50,16 @@ class Events:
                 os.write(tell, b"!")
 
 
+def run_cells(content: Any, variables: dict[str, Any], parameters: dict[str, Any]) -> None:
+    """Execute the cells of a notebook in this process, with these variables; as papermill, with these parameters."""
+    for cell in content.cells:
+        if cell.cell_type == "code":
+            source = "\n".join(line for line in cell.source.split("\n") if not line.startswith("%"))
+            exec(compile(source, cell.id, "exec"), variables)
+            if "parameters" in cell.metadata.get("tags", []):
+                variables |= parameters
+
+
 def execute_cells(
     events: Events, path: Path, output: Path, parameters: dict[str, Any], *_: object
 ) -> tuple[Any, float]:
@@ -67,12 +77,8 @@ def execute_cells(
 
     IPython.display.display = display
     variables: dict[str, Any] = {"display": display}
-    for cell in content.cells:
-        if cell.cell_type == "code":
-            source = "\n".join(line for line in cell.source.split("\n") if not line.startswith("%"))
-            exec(compile(source, path.name, "exec"), variables)
-            if "parameters" in cell.metadata.get("tags", []):
-                variables |= parameters
+    notebook._user_names = lambda: variables
+    run_cells(content, variables, parameters)
     content.cells[-1].outputs = outputs
     with write_atomic(output) as temporary:
         nbformat.write(content, temporary)
