@@ -53,6 +53,7 @@ OK, LOW = QueryResult(Status.OK, "", np.eye(4)), QueryResult(Status.LOW_CONFIDEN
 VAGUE = replace(OK, covariance=np.eye(6))
 FAILED = QueryResult.failed("no consistent pose")
 DOUBTED = QueryResult(Status.LOW_CONFIDENCE, CAMERA, np.eye(4), misfit=True)
+ALIKE = replace(LOW, rivals=(Rival(np.eye(4), 0.95),))
 SLIGHT = replace(VAGUE, misfit=True)  # a misfit that shows in the covariance alone
 
 
@@ -69,6 +70,7 @@ SLIGHT = replace(VAGUE, misfit=True)  # a misfit that shows in the covariance al
         (LOW, FAILED, "low_confidence", "pnp"),
         (VAGUE, OK, "ok", "pnp+sift"),
         (VAGUE, LOW, "ok", "pnp"),
+        (VAGUE, ALIKE, "low_confidence", "pnp+sift"),
         (FAILED, FAILED, "failed: no consistent pose", "pnp"),
     ],
 )

@@ -430,7 +430,7 @@ class Map:
         result = replace(result, found_by="+".join([result.found_by, *(kind.name for kind in self.escalation)]))
         if first.status is Status.OK:
             result = self._with_rivals_of(first, result)
-        better = result.status.rank >= max(first.status.rank, 1)
+        better = result.status.rank >= max(first.status.rank, 1) or self._finds_rival(result)
         earlier = first.first_seconds
         return replace(
             result if better else first,
@@ -439,6 +439,11 @@ class Map:
             first_seconds=round(first.seconds, 4) if earlier is None else earlier,
             context=first.context,  # it has all references
         )
+
+    def _finds_rival(self, result: QueryResult) -> bool:
+        """Tell whether a pose cannot be `ok` beside its rivals, even if all else is certain."""
+        beside = bounded_by_rivals(1.0, [rival.support for rival in result.rivals])
+        return result.status is Status.LOW_CONFIDENCE and beside < self.settings.pnp.ok_probability
 
     def _with_rivals_of(self, first: QueryResult, result: QueryResult) -> QueryResult:
         """Return a result that also has the rivals of an `ok` first one, whose places few references may not show."""
