@@ -263,9 +263,11 @@ def settings(branch: Annotated[str, Argument(help="Only these, e.g. localize or 
 def lab(context: typer.Context) -> None:
     """Open JupyterLab on your own copies of the notebooks, in lab/; further options go to JupyterLab."""
     from toolkit.files import shipped
+    from toolkit.manifest import find_manifest
     from toolkit.notebook import copy_notebooks
 
     optional("jupyterlab")
+    find_manifest("demo")  # makes this folder the one whose runs/ the notebooks see
     for message in copy_notebooks(Path("lab")):
         print(message)
     # The page shows the whole folder, so that links from a notebook to a run's report and recordings work.
