@@ -54,6 +54,7 @@ def test_what_is_no_run_names_those_beside_it(tmp_path: Path) -> None:
         Run.open(tmp_path / "fos")
     run = Run.open(tmp_path / "fox")
     assert run.queries.empty
+    assert "No queries" in run._repr_html_()
     with pytest.raises(ArtifactError, match="found the scenes none"):
         run.map("ios")
 

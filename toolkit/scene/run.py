@@ -398,7 +398,8 @@ class Run:
         queries, keys = self.queries, ["scene", "map_device", "query_device"]
         of_status = queries.assign(status=statuses(queries["status"])).groupby([*keys, "status"])
         counts = of_status.size().unstack(fill_value=0).reindex(columns=list(Status), fill_value=0)
-        return f"<p><b>{escape(self.path.name)}</b>: {escape(str(self.path))}</p>{counts.to_html()}"
+        told = counts.to_html() if len(queries) else "<p>No queries: a map alone.</p>"
+        return f"<p><b>{escape(self.path.name)}</b>: {escape(str(self.path))}</p>{told}"
 
     @cached_property
     def record(self) -> dict[str, Any]:
