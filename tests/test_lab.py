@@ -9,7 +9,7 @@ from nbconvert import HTMLExporter
 from traitlets.config import PyFileConfigLoader
 from typer.testing import CliRunner
 
-from toolkit import notebook
+from toolkit import notebook, pipeline
 from toolkit.__main__ import app
 from toolkit.notebook import NOTEBOOKS
 
@@ -76,3 +76,26 @@ def test_lab_is_on_copies_that_keep_what_was_done_in_them(tmp_path: Path, monkey
     assert said.count("newer") == 1
     ignored = (NOTEBOOKS.parent / ".gitignore").read_text().splitlines()
     assert "/lab/" in ignored
+
+
+def test_copies_take_the_runs_of_the_folder_that_lab_was_started_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kernel works in lab/; the demo ran again there, and the one beside it was not found."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "execv", lambda *_: None)
+    assert CliRunner().invoke(app, ["lab"], catch_exceptions=False).exit_code == 0
+    (mine := tmp_path / "runs" / "mine").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "lab")
+    assert notebook.find_run("runs/mine") == mine
+    asked: list[Path] = []
+
+    def make(manifest: Path) -> None:
+        asked.append(manifest)
+        raise RuntimeError
+
+    monkeypatch.setattr(pipeline, "run", make)
+    with pytest.raises(RuntimeError):
+        pipeline.open_run("runs/demo")
+    assert asked == [tmp_path / "data_manifests" / "demo.yaml"]
+    assert not (tmp_path / "lab" / "data_manifests").exists()

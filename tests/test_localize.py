@@ -38,6 +38,7 @@ from toolkit.evaluate import evaluate_scene
 from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor, SiftSettings
 from toolkit.features.matching import MATCHERS, LocalMethod, MutualMatcher, unit_descriptors
 from toolkit.features.stores import extract_session
+from toolkit.figures import top_view
 from toolkit.files import SceneFiles, image_name, map_record_path, read_map_record, read_references, sidecar_path
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
 from toolkit.manifest import EmbedSettings, LocalizeSettings
@@ -49,6 +50,7 @@ from toolkit.prediction import network as predictors
 from toolkit.prediction.interface import Prediction
 from toolkit.prediction.network import SimulatedPredictor
 from toolkit.rerank import rerank_pairs
+from toolkit.results.localized import sure_points
 from toolkit.results.pair import PairResults
 from toolkit.retrieve import load_embeddings, retrieve_pairs
 from toolkit.scene import map as maps
@@ -734,7 +736,9 @@ def test_a_picture_without_a_camera_that_tells_nothing(opened: Map) -> None:
     assert "480 px, a guess" in answer.remark
 
 
-def test_photographs_on_the_command_line(opened: Map, small_capture: Path, tmp_path: Path) -> None:
+def test_photographs_on_the_command_line(
+    opened: Map, small_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     session = Capture.open(small_capture)["ios_query"]
     assert opened.files is not None
     run = tmp_path / "run"
@@ -744,8 +748,13 @@ def test_photographs_on_the_command_line(opened: Map, small_capture: Path, tmp_p
     camera = camera_text(session.camera(session.images["sensor_id"].iloc[0]))
     command = ["localize", str(run), photo, str(tmp_path / "nowhere.jpg"), "--camera", camera, "--json"]
     before = snapshot(run)
+    drawn: list[tuple[Any, ...]] = []
+    draw_scene = top_view.draw_scene
+    monkeypatch.setattr(top_view, "draw_scene", lambda *a, **k: drawn.append((*a, k["title"])) or draw_scene(*a, **k))
     result = CliRunner().invoke(app, [*command, "--picture", str(tmp_path / "above.png")])
     assert result.exit_code == 0
+    np.testing.assert_array_equal(drawn[0][0], sure_points(opened.mapped[0].map)[0], "without points that are noisy")
+    assert drawn[0][-1] == "Photographs in the map, from above: 1 of 2 have a pose"
     answer, missing = json.loads(result.stdout)["photographs"]
     expected = localize_image(opened, photo, session.camera(session.images["sensor_id"].iloc[0]))
     assert answer["status"] == expected.status_text

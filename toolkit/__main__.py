@@ -194,7 +194,8 @@ def localize(
     origin = None
     with suppress(CaptureError):
         origin = origin_of(place.session)
-    rows, poses = [], [np.full((4, 4), np.nan)]
+    rows: list[dict[str, Any]] = []
+    poses: list[Any] = []
     for path, result in zip(photographs, localize_images(place, photographs, given), strict=True):
         row: dict[str, Any] = {"image": str(path), "status": result.status_text, "world_from_cam": None}
         row |= {"inliers": result.num_inliers, "remark": result.remark}
@@ -218,13 +219,14 @@ def localize(
                           f"heading {geo[3]:.1f}, pitch {geo[4]:.1f} degrees")  # fmt: skip
     if picture is not None:
         from toolkit.figures.top_view import draw_scene
+        from toolkit.results.localized import sure_points
 
-        points, colors = np.zeros((0, 3)), None
-        for mapped in place.mapped[:1]:
-            points, colors = mapped.map.points, mapped.map.colors
-        found, true, title = np.stack(poses), np.full((len(poses), 4, 4), np.nan), "Photographs in the map, from above"
+        cloud = sure_points(place.mapped[0].map if place.mapped else None)
+        found = np.array(poses).reshape(-1, 4, 4)
+        title = f"Photographs in the map, from above: {len(poses)} of {len(rows)} have a pose"
         unit = ("m" if place.capture.unit else "unknown unit", 1.0)
-        draw_scene(points, colors, place.session.world_from_cam(), found, true, title=title, unit=unit).savefig(picture)
+        cameras = place.session.world_from_cam()
+        draw_scene(*cloud, cameras, found, np.full_like(found, np.nan), title=title, unit=unit).savefig(picture)
         print(f"Picture: {picture}", file=sys.stderr if as_json else sys.stdout)
     if as_json:
         _print_json({"run": str(run), "photographs": rows})
@@ -263,9 +265,11 @@ def settings(branch: Annotated[str, Argument(help="Only these, e.g. localize or 
 def lab(context: typer.Context) -> None:
     """Open JupyterLab on your own copies of the notebooks, in lab/; further options go to JupyterLab."""
     from toolkit.files import shipped
+    from toolkit.manifest import find_manifest
     from toolkit.notebook import copy_notebooks
 
     optional("jupyterlab")
+    find_manifest("demo")  # makes this folder the one whose runs/ the notebooks see
     for message in copy_notebooks(Path("lab")):
         print(message)
     # The page shows the whole folder, so that links from a notebook to a run's report and recordings work.

@@ -444,11 +444,11 @@ def shipped(folder: str) -> Path:
 
 
 def project_root() -> Path:
-    """Return the folder with `data/` and `runs/`: the clone; of an installed package, the nearest one from here up."""
-    if not (_PACKAGE / "notebooks").is_dir():
-        return _PACKAGE.parent
+    """Return the folder with `data/` and `runs/`: the nearest one from here up with manifests; else the clone, or where
+    there is none, this folder."""
     here = Path.cwd()
-    return next((folder for folder in (here, *here.parents) if (folder / "data_manifests").is_dir()), here)
+    otherwise = here if (_PACKAGE / "notebooks").is_dir() else _PACKAGE.parent
+    return next((folder for folder in (here, *here.parents) if (folder / "data_manifests").is_dir()), otherwise)
 
 
 RUN_FILES = (

@@ -41,6 +41,7 @@ from toolkit.files import (
     fingerprint,
     of_sequence,
     older_files,
+    project_root,
     read_json,
     write_text,
 )
@@ -157,7 +158,7 @@ def open_run(folder: str | Path, notebook: str = "start") -> "Run":
     check_given(notebook)
     path = find_run(folder)
     if not (path / RECORD).is_file() and is_demo(path):
-        run(find_manifest("demo"))
+        run(find_manifest("demo", project_root()))
     return Run.open(path)
 
 
@@ -175,7 +176,7 @@ def runs_to_compare(folder: str | Path, others: Sequence[str | Path] | None = No
         return sorted(record.parent for record in first.parent.glob(f"{first.name}-*/{RECORD}"))
 
     if not beside() and is_demo(first):
-        demo = find_manifest("demo")
+        demo = find_manifest("demo", project_root())
         _, failed = sweep(demo, ["localize.features=sift"], ["name=demo", "visualize.recordings=false"])
         for error in failed:
             raise error

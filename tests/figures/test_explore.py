@@ -20,7 +20,8 @@ def test_unusable_sessions_have_a_reason_and_the_others_are_drawn(tmp_path: Path
     assert "keyframe list" in table["reason"]["ios_query"]
     assert table["reason"]["ios_map"] == ""
     assert table["images"]["hl_query"] == 0
-    assert len(draw_samples(capture, 1).axes) == 3
+    samples = draw_samples(capture, 1).axes
+    assert [axis.get_title("left") for axis in samples] == ["hl_map", "ios_map", "ios_query"]
     assert "[m]" in draw_top_view(capture).axes[0].get_xlabel()
     assert "[" not in draw_top_view(capture, unit=None).axes[0].get_xlabel()
 

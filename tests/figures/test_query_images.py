@@ -95,6 +95,20 @@ def test_scene_picture_without_points_truth_or_queries(scene):
     assert draw_scene(np.zeros((0, 3)), None, poses[:1], no_queries, no_queries)
 
 
+def texts_of(figure):
+    texts = [axis.get_title() for axis in figure.axes]
+    return texts + [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+
+
+def test_scene_picture_speaks_of_true_positions_only_where_they_are_known(scene):
+    points, colors, poses, estimated, true = scene
+    assert "query, estimated; a line joins it to its true position" in texts_of(draw_scene(*scene))
+    texts = texts_of(draw_scene(points, colors, poses, estimated[:1], np.full_like(true[:1], np.nan)))
+    assert "query, estimated" in texts
+    assert "place 1: " in texts
+    assert not any("true" in text or "of" in text.split() for text in texts)
+
+
 @pytest.fixture
 def images(tmp_path):
     """A query image with five matches, of which one is rejected, and a reference twice as high that sees two."""

@@ -67,6 +67,9 @@ def test_a_result_shows_itself_with_its_true_error(scene_map: Map, result: Query
     answer = result.show()
     assert isinstance(answer, Answer)
     assert picture_of(answer).width > 800
+    alone = replace(answer)  # `details` are cached; without references, their row was left empty
+    alone.__dict__["details"] = replace(answer.details, references=[])
+    assert alone.figure.get_size_inches()[1] < answer.figure.get_size_inches()[1] - 1
     true = scene_map.capture["ios_query"].world_from_cam([0], ground_truth=True)[0]
     np.testing.assert_allclose(answer.true_pose, true, atol=1e-12)
     assert answer.error[1] == pytest.approx(np.linalg.norm(true[:3, 3] - result.world_from_rig[:3, 3]))

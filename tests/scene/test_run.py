@@ -1,5 +1,6 @@
 """A run in the hand."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from toolkit.scene import Run
 @pytest.mark.slow
 def test_a_run_has_its_settings_maps_and_queries(small_run: Path, released_weights: None) -> None:
     run = Run.open(small_run)
+    assert re.findall("<th>(ok|low_confidence|failed)</th>", run._repr_html_()) == ["ok", "low_confidence", "failed"]
     assert run.scenes == ["SMALL"]
     assert run.settings["name"] == small_run.name
     queries = run.queries
@@ -52,6 +54,7 @@ def test_what_is_no_run_names_those_beside_it(tmp_path: Path) -> None:
         Run.open(tmp_path / "fos")
     run = Run.open(tmp_path / "fox")
     assert run.queries.empty
+    assert "No queries" in run._repr_html_()
     with pytest.raises(ArtifactError, match="found the scenes none"):
         run.map("ios")
 
@@ -68,6 +71,8 @@ def test_a_map_by_itself_localizes_as_a_run_with_queries(small_capture: Path, tm
     assert (run.scenes, run.record["status"], run.queries.empty) == (["PLACE"], "done", True)
     with pytest.raises(ArtifactError, match="no map of 'hl'"):
         run.map("hl")
+    mapped = run.map().session  # what start.ipynb takes in the hand; it ended with an error
+    assert run.best_query("ios").views[0].image == mapped.image_path(len(mapped) // 2)
     session = Capture.open(small_capture)["ios_query"]
     cameras = session.cameras(np.arange(3))
     results = [localize_image(run.map(), session.image_path(row), camera) for row, camera in enumerate(cameras)]

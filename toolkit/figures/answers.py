@@ -308,7 +308,9 @@ def draw_answers(answers: Sequence[Answer], title: str) -> "Figure":
     has its further references.
     """
     several = len(answers) > 1
-    heights = [3.3, 3.6] if several else [4.0, 2.0, 3.6]
+    details = answers[0].details
+    further = not several and len(details.cameras) + len(details.captioned_references()) > 2
+    heights = [3.3 if several else 4.0, *[2.0] * further, 3.6]
     figure = new_figure(11, sum(heights) - 0.1)
     above, *strip, below = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
     for axis, answer, name in zip(above.subplots(1, len(answers), squeeze=False)[0], answers, NAMES, strict=False):
@@ -324,7 +326,7 @@ def draw_answers(answers: Sequence[Answer], title: str) -> "Figure":
             columns = 3 if several else 6
             axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=columns, fontsize=7.5)
     for part in strip:
-        _draw_further(part, answers[0].details)
+        _draw_further(part, details)
     from_above, near, table = below.subplots(1, 3, width_ratios=[1.0, 0.9, 1.0 + 0.25 * several])
     _draw_from_above(from_above, answers)
     _draw_near(near, answers)

@@ -102,7 +102,7 @@ def draw_samples(capture: Capture, count: int = 4) -> "Figure":
     for line, session in zip(figure.subplots(len(sessions), count, squeeze=False), sessions, strict=True):
         for axis, row in zip(line, np.linspace(0, len(session) - 1, count).round().astype(int), strict=True):
             draw_image(axis, session.image_path(row), 2.4)
-        line[0].set_ylabel(session.id)
+        line[0].set_title(session.id, fontsize=8, loc="left")
     return figure
 
 

@@ -165,7 +165,7 @@ def draw_query_and_references(
         row[0].set_axis_on()
         draw_image(row[0], image, 2.0, "query", frame="black")
         for rank, (axis, (file, score)) in enumerate(zip(row[1:], found, strict=False), start=1):
-            draw_image(axis, file, 2.0, f"{rank}: {score:.3g}")
+            draw_image(axis, file, 2.0, f"{rank}: {score:.2f}")
     return figure
 
 

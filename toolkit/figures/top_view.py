@@ -200,6 +200,7 @@ def draw_scene(
     has_estimate, has_truth = is_posed(estimated), is_posed(true)
     both, lost = has_estimate & has_truth, has_truth & ~has_estimate
     errors = error_colors(np.linalg.norm(estimated[:, :3, 3] - true[:, :3, 3], axis=1) / unit[1]) / 255.0
+    joined = "; a line joins it to its true position" if both.any() else ""
     line: dict[str, Any] = {"track": True, "lw": 0.7, "alpha": 0.5, "zorder": 2}
     layers = [
         Layer(points, None, tint, s=1.2, lw=0, rasterized=True),
@@ -208,7 +209,7 @@ def draw_scene(
         Layer(map_poses, "map cameras", MAP, 0.035, s=9, lw=0, zorder=3),
         Layer(true[both], "query, true", TRUE, hollow=True, s=52, lw=1.2, zorder=5),
         Layer(true[lost], "query without a pose, true", ESTIMATED, s=42, marker="x", lw=1.8, zorder=6),
-        Layer(estimated[has_estimate], "query, estimated; a line joins it to its true position", errors[has_estimate],
+        Layer(estimated[has_estimate], f"query, estimated{joined}", errors[has_estimate] if joined else ESTIMATED,
               0.035, s=16, lw=0, zorder=5),
     ]  # fmt: skip
     anchors = np.where(has_truth[:, None, None], true, estimated)
@@ -218,12 +219,14 @@ def draw_scene(
     of_place = places.nearest(ground.flat(anchors))
     for axis, place, (low, high) in panels:
         here = of_place == place
-        joined = both & here
-        axis.add_collection(LineCollection(list(joins[joined]), colors=errors[joined], linewidths=1.6, zorder=4))
+        ends = both & here
+        axis.add_collection(LineCollection(list(joins[ends]), colors=errors[ends], linewidths=1.6, zorder=4))
         name = f"place {place + 1}: " if places.numbers.any() else ""
         outside = int((((centers < low) | (centers > high)).any(axis=1) & here).sum())
         far = f", {outside} estimated outside the picture" if outside else ""
-        axis.set_title(f"{name}{(has_estimate & here).sum()} of {here.sum()} queries have a pose{far}", fontsize=9)
+        # Without truth, it is not known in which place those without a pose are.
+        counts = f"{(has_estimate & here).sum()} of {here.sum()} queries have a pose" if has_truth.any() else ""
+        axis.set_title(f"{name}{counts}{far}", fontsize=9)
     axes = [axis for axis, _, _ in panels]
     if both.any():
         error_bar(figure, unit[0], ax=axes, shrink=0.8)

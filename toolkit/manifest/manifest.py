@@ -304,13 +304,14 @@ def load_manifest(path: str | Path, overrides: Iterable[str] = ()) -> Manifest:
     return manifest
 
 
-def find_manifest(given: str | Path) -> Path:
+def find_manifest(given: str | Path, here: Path = Path()) -> Path:
     """Return the path of a manifest that is given by its path or by its name, such as `demo`.
 
-    One that is not here but comes with the toolkit is copied to `data_manifests/` first, with those that it inherits,
-    so that its data and runs are here, too, and a user can see and change it. Raise ManifestError if there is none.
+    One that is not in the folder `here` but comes with the toolkit is copied to its `data_manifests/` first, with those
+    that it inherits, so that its data and runs are here, too, and a user can see and change it. Raise ManifestError if
+    there is none.
     """
-    path, folder = Path(given), Path("data_manifests")
+    path, folder = Path(given), here / "data_manifests"
     name = path.name if path.suffix in (".yaml", ".yml") else f"{path.name}.yaml"
     if path.is_file() or path.parent not in (Path(), folder):
         return path

@@ -397,8 +397,9 @@ class Run:
     def _repr_html_(self) -> str:
         queries, keys = self.queries, ["scene", "map_device", "query_device"]
         of_status = queries.assign(status=statuses(queries["status"])).groupby([*keys, "status"])
-        counts = of_status.size().unstack(fill_value=0)
-        return f"<p><b>{escape(self.path.name)}</b>: {escape(str(self.path))}</p>{counts.to_html()}"
+        counts = of_status.size().unstack(fill_value=0).reindex(columns=list(Status), fill_value=0)
+        told = counts.to_html() if len(queries) else "<p>No queries: a map alone.</p>"
+        return f"<p><b>{escape(self.path.name)}</b>: {escape(str(self.path))}</p>{told}"
 
     @cached_property
     def record(self) -> dict[str, Any]:
@@ -462,12 +463,19 @@ class Run:
         return WorstQueries(poses, map_device=map_device or "all").look(name).result
 
     def best_query(self, map_device: str, scene: str | None = None) -> Query:
-        """Return the query that was localized in a map: an `ok` one if there is any, with the most inliers.
+        """Return the query that was localized in a map: an `ok` one if there is any, with the most inliers. If the run
+        is a map alone, return images of the map that one device took at one instant.
 
         Raises:
             ArtifactError: no query was localized in the map.
         """
         queries = self.queries
+        if not len(queries):
+            place = self.map(map_device, scene)
+            takes = list(zip(place.session.images["timestamp"], place.session.device_ids, strict=True))
+            middle = takes[len(takes) // 2]
+            rows = np.array([row for row, take in enumerate(takes) if take == middle])
+            return place.query_of_session(place.session, rows)
         of_map = queries[(queries["map_device"] == map_device) & (queries["scene"] == self._scene(scene))]
         status = statuses(of_map["status"])
         of_map = of_map.assign(sure=status == str(Status.OK))[status != str(Status.FAILED)]
