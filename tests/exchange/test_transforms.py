@@ -296,6 +296,20 @@ def test_the_splits_of_the_file_are_map_and_queries(tmp_path: Path) -> None:
     assert (queries.images["status"] == "imported").all()
 
 
+@pytest.mark.parametrize("suffix", ["", ".png"])
+def test_the_splits_are_matched_without_extensions_if_only_one_frame_fits(suffix: str, tmp_path: Path) -> None:
+    frames = [{"file_path": f"./images/{name}", "transform_matrix": matrix(0)} for name in ("0.jpg", "1.jpg", "a", "b")]
+    frames += [{"file_path": f"images/c.{suffix}", "transform_matrix": matrix(1)} for suffix in ("jpg", "png")]
+    split = {"train_filenames": [f"images/0{suffix}", "images/a.JPG"], "test_filenames": [f"images\\1{suffix}"]}
+    split["val_filenames"] = ["./images/b", "images/c", "images/gone.jpg"]
+    report = import_transforms(write(tmp_path, frames, **split), tmp_path / "PLACE")
+    assert report.held_out is not None
+    taken = [one.images.query("status == 'imported'")["image"].tolist() for one in (report, report.held_out)]
+    assert taken == [["images/0.jpg", "images/a.png"], ["images/1.jpg", "images/b.png"]]
+    assert any(note.startswith("3 names in these lists match but for their extensions, as ") for note in report.notes)
+    assert "2 names in these lists are of no frame, or of several, as 'images/c'" in report.notes
+
+
 def test_the_world_of_the_input_is_restored(tmp_path: Path) -> None:
     turn = make_pose(quaternion_to_rotation([0.5, -0.5, 0.5, 0.5]), [1.0, -2.0, 3.0])
     given = [turn @ matrix(k) for k in range(3)]

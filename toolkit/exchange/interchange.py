@@ -30,9 +30,9 @@ import os
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatch
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import cv2
@@ -524,8 +524,6 @@ def import_transforms(
     options.setdefault("axes", "opengl")
     draft = start(capture, device, split, path.parent, **options)
     content = _read_transforms(path)
-    held = _named(content, "val_filenames", "test_filenames")
-    own_split = own_split and bool(held) and split == "map" and not draft.hold_out
     frames: dict[str, _TransformsFrame] = {}
     applied = _applied(path, content)
     again: dict[str, CaptureError] = {}
@@ -538,12 +536,16 @@ def import_transforms(
         first = frames.setdefault(frame.name, frame)
         if frame.values != first.values:
             again[frame.name] = frame.error("file_path", f"that of frame {first.number} again", "one frame per image")
-    trained = _named(content, "train_filenames") or {frame.listed for frame in frames.values()} - held
+    in_lists = [_named(content, *keys) for keys in (("val_filenames", "test_filenames"), ("train_filenames",))]
+    meant = _frames_of(set().union(*in_lists), frames)
+    held, trained = ({meant[name] for name in names if name in meant} for names in in_lists)
+    trained = trained if in_lists[1] else set(frames) - held
+    own_split = own_split and bool(held) and split == "map" and not draft.hold_out
     for name, frame in sorted(frames.items()):
         try:
             if name in again:
                 raise again[name]
-            if own_split and frame.listed not in held | trained:
+            if own_split and name not in held | trained:
                 raise CaptureError("it is in none of train_filenames, val_filenames and test_filenames")
             pose = frame.world_from_named()
             pose = _undone(pose, *applied) if undo_applied else pose
@@ -555,6 +557,11 @@ def import_transforms(
         draft.notes.append("map and queries: train_filenames, and val_filenames and test_filenames of the file")
     elif held and split == "map":
         draft.notes.append(f"val_filenames and test_filenames ({len(held)} images) of the file are not used")
+    if split == "map" and (loose := [name for name, frame in meant.items() if name != frames[frame].listed]):
+        names = f"{loose[0]!r} is {frames[meant[loose[0]]].listed!r}"
+        draft.notes.append(f"{len(loose)} names in these lists match but for their extensions, as {names}")
+    if split == "map" and (missing := sorted(set().union(*in_lists) - set(meant))):
+        draft.notes.append(f"{len(missing)} names in these lists are of no frame, or of several, as {missing[0]!r}")
     if found := sum(frame.from_elsewhere for frame in frames.values()):
         draft.notes.append(FROM_ELSEWHERE.format(found))
     turn, scale = applied
@@ -562,8 +569,7 @@ def import_transforms(
         world = "that of the file's input" if undo_applied else "the file's, turned from that of its input"
         other = "" if undo_applied else ". For the input's, as of a COLMAP model beside it, give --undo-applied"
         draft.notes.append(f"applied_transform, applied_scale {scale:g}: the world is {world}{other}")
-    of_file = {name for name, frame in frames.items() if frame.listed in held}
-    return draft.finish(of_file if own_split else every_nth(sorted(frames), draft.hold_out))
+    return draft.finish(held if own_split else every_nth(sorted(frames), draft.hold_out))
 
 
 def _read_transforms(path: Path) -> dict[str, Any]:
@@ -584,6 +590,24 @@ def _named(content: Mapping[str, Any], *keys: str) -> set[str]:
     """Return the images in lists of the file, as they are written there."""
     lists = (content.get(key) for key in keys)
     return {name for names in lists if isinstance(names, list) for name in names if isinstance(name, str)}
+
+
+def _frames_of(names: Iterable[str], frames: Mapping[str, "_TransformsFrame"]) -> dict[str, str]:
+    """Return the frames that names in lists of the file mean: that of the same path, else the only one of the same path
+    but for its extension.
+    """
+    same = {frame.listed: name for name, frame in frames.items()}
+    alike: dict[str, list[str]] = {}
+    for name, frame in frames.items():
+        alike.setdefault(_without_suffix(frame.listed), []).append(name)
+    fitting = {name: [same[name]] if name in same else alike.get(_without_suffix(name), []) for name in sorted(names)}
+    return {name: found[0] for name, found in fitting.items() if len(found) == 1}
+
+
+def _without_suffix(image: str) -> str:
+    """Return an image's path without its extension, with forward slashes."""
+    path = PurePosixPath(image.replace("\\", "/"))
+    return str(path.with_suffix("") if path.suffix.lower() in READ_SUFFIXES else path)
 
 
 def _applied(path: Path, content: Mapping[str, Any]) -> tuple[Floats, float]:
