@@ -322,6 +322,12 @@ def test_the_world_of_the_input_is_restored(tmp_path: Path) -> None:
     session = imported(file, tmp_path / "PLACE", undo_applied=True, unit_m=1.0)
     for k, found in enumerate(session.world_from_cam()):
         np.testing.assert_allclose(found, np.array(matrix(k)) @ np.diag([1, -1, -1, 1]), rtol=0, atol=1e-9)
+    differ = "applied_transform of ios_map is another or none, so its world is another. Give --undo-applied"
+    for first, then in ((False, False), (True, False), (False, True), (True, True)):
+        place = tmp_path / f"{first}{then}"
+        import_transforms(file, place, undo_applied=first)
+        query = import_transforms(file, place, split="query", undo_applied=then)
+        assert any(note.startswith(differ) for note in query.notes) == (first != then)
     write(tmp_path, frames, applied_transform=[[1, 0], [0, 1]])
     with pytest.raises(CaptureError, match="applied_transform"):
         import_transforms(file, tmp_path / "OTHER")

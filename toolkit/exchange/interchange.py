@@ -566,6 +566,7 @@ def import_transforms(
         draft.notes.append(FROM_ELSEWHERE.format(found))
     turn, scale = applied
     if not (np.array_equal(turn, np.eye(4)) and scale == 1):
+        draft.record |= {} if undo_applied else {"applied": [*turn[:3].ravel().tolist(), scale]}
         world = "that of the file's input" if undo_applied else "the file's, turned from that of its input"
         other = "" if undo_applied else ". For the input's, as of a COLMAP model beside it, give --undo-applied"
         draft.notes.append(f"applied_transform, applied_scale {scale:g}: the world is {world}{other}")
