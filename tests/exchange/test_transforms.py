@@ -15,7 +15,7 @@ from toolkit.capture import Capture, Session
 from toolkit.capture.check import check_capture
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.drafts import list_images
-from toolkit.exchange.interchange import import_transforms
+from toolkit.exchange.interchange import import_images, import_transforms
 from toolkit.geometry import invert, make_pose, quaternion_to_rotation, transform
 
 SIZE = (64, 48)
@@ -331,6 +331,26 @@ def test_the_world_of_the_input_is_restored(tmp_path: Path) -> None:
     write(tmp_path, frames, applied_transform=[[1, 0], [0, 1]])
     with pytest.raises(CaptureError, match="applied_transform"):
         import_transforms(file, tmp_path / "OTHER")
+
+
+@pytest.mark.parametrize(
+    ("text", "tool", "command"),
+    [
+        ('[{"cameras": {}, "shots": {"0.jpg": {"rotation": [0, 0, 0]}}}]', "OpenSfM", "opensfm export_colmap"),
+        ('{"sfm_data_version": "0.3", "views": []}', "OpenMVG", "openMVG_main_openMVG2Colmap"),
+        ("# kapture format: 1.1\n# timestamp, device_id, qw\n0, a, 1\n", "kapture", "kapture_export_colmap.py"),
+    ],
+)
+def test_files_of_other_tools_are_told_how_to_come(text: str, tool: str, command: str, tmp_path: Path) -> None:
+    write(tmp_path)
+    file = tmp_path / ("poses.txt" if tool == "kapture" else "poses.json")
+    file.write_text(text)
+    told = rf"poses.{file.suffix[1:]}: found a file of {tool}.*`{command}`"
+    with pytest.raises(CaptureError, match=told):
+        import_images(tmp_path / "images", tmp_path / "PLACE", table=file, split="map")
+    if file.suffix == ".json":
+        with pytest.raises(CaptureError, match=told):
+            import_transforms(file, tmp_path / "PLACE")
 
 
 @pytest.mark.parametrize("root", ["/home/them/project/", "C:/Users/them/", "C:\\Users\\them\\"])
