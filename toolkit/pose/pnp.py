@@ -561,9 +561,7 @@ class PnpLocalizer(Localizer):
             view_pixels=np.concatenate([np.zeros((0, 2)), *(pixels for _, _, pixels in views)]),
         )
 
-    def _covariance(
-        self, query: RigQuery, rig_from_world: Floats, guided: Matches, inliers: Matches
-    ) -> Floats | None:
+    def _covariance(self, query: RigQuery, rig_from_world: Floats, guided: Matches, inliers: Matches) -> Floats | None:
         """Return the covariance (6, 6) of a pose estimated from guided matches; None if it is undefined.
 
         Guided matches were searched near the pose, so their errors are small wherever it is. Only those that were also
