@@ -15,7 +15,7 @@ from toolkit.capture import Capture, Session
 from toolkit.capture.check import check_capture
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.drafts import list_images
-from toolkit.exchange.interchange import import_transforms
+from toolkit.exchange.interchange import import_images, import_transforms
 from toolkit.geometry import invert, make_pose, quaternion_to_rotation, transform
 
 SIZE = (64, 48)
@@ -296,6 +296,20 @@ def test_the_splits_of_the_file_are_map_and_queries(tmp_path: Path) -> None:
     assert (queries.images["status"] == "imported").all()
 
 
+@pytest.mark.parametrize("suffix", ["", ".png"])
+def test_the_splits_are_matched_without_extensions_if_only_one_frame_fits(suffix: str, tmp_path: Path) -> None:
+    frames = [{"file_path": f"./images/{name}", "transform_matrix": matrix(0)} for name in ("0.jpg", "1.jpg", "a", "b")]
+    frames += [{"file_path": f"images/c.{suffix}", "transform_matrix": matrix(1)} for suffix in ("jpg", "png")]
+    split = {"train_filenames": [f"images/0{suffix}", "images/a.JPG"], "test_filenames": [f"images\\1{suffix}"]}
+    split["val_filenames"] = ["./images/b", "images/c", "images/gone.jpg"]
+    report = import_transforms(write(tmp_path, frames, **split), tmp_path / "PLACE")
+    assert report.held_out is not None
+    taken = [one.images.query("status == 'imported'")["image"].tolist() for one in (report, report.held_out)]
+    assert taken == [["images/0.jpg", "images/a.png"], ["images/1.jpg", "images/b.png"]]
+    assert any(note.startswith("3 names in these lists match but for their extensions, as ") for note in report.notes)
+    assert "2 names in these lists are of no frame, or of several, as 'images/c'" in report.notes
+
+
 def test_the_world_of_the_input_is_restored(tmp_path: Path) -> None:
     turn = make_pose(quaternion_to_rotation([0.5, -0.5, 0.5, 0.5]), [1.0, -2.0, 3.0])
     given = [turn @ matrix(k) for k in range(3)]
@@ -308,9 +322,35 @@ def test_the_world_of_the_input_is_restored(tmp_path: Path) -> None:
     session = imported(file, tmp_path / "PLACE", undo_applied=True, unit_m=1.0)
     for k, found in enumerate(session.world_from_cam()):
         np.testing.assert_allclose(found, np.array(matrix(k)) @ np.diag([1, -1, -1, 1]), rtol=0, atol=1e-9)
+    differ = "applied_transform of ios_map is another or none, so its world is another. Give --undo-applied"
+    for first, then in ((False, False), (True, False), (False, True), (True, True)):
+        place = tmp_path / f"{first}{then}"
+        import_transforms(file, place, undo_applied=first)
+        query = import_transforms(file, place, split="query", undo_applied=then)
+        assert any(note.startswith(differ) for note in query.notes) == (first != then)
     write(tmp_path, frames, applied_transform=[[1, 0], [0, 1]])
     with pytest.raises(CaptureError, match="applied_transform"):
         import_transforms(file, tmp_path / "OTHER")
+
+
+@pytest.mark.parametrize(
+    ("text", "tool", "command"),
+    [
+        ('[{"cameras": {}, "shots": {"0.jpg": {"rotation": [0, 0, 0]}}}]', "OpenSfM", "opensfm export_colmap"),
+        ('{"sfm_data_version": "0.3", "views": []}', "OpenMVG", "openMVG_main_openMVG2Colmap"),
+        ("# kapture format: 1.1\n# timestamp, device_id, qw\n0, a, 1\n", "kapture", "kapture_export_colmap.py"),
+    ],
+)
+def test_files_of_other_tools_are_told_how_to_come(text: str, tool: str, command: str, tmp_path: Path) -> None:
+    write(tmp_path)
+    file = tmp_path / ("poses.txt" if tool == "kapture" else "poses.json")
+    file.write_text(text)
+    told = rf"poses.{file.suffix[1:]}: found a file of {tool}.*`{command}`"
+    with pytest.raises(CaptureError, match=told):
+        import_images(tmp_path / "images", tmp_path / "PLACE", table=file, split="map")
+    if file.suffix == ".json":
+        with pytest.raises(CaptureError, match=told):
+            import_transforms(file, tmp_path / "PLACE")
 
 
 @pytest.mark.parametrize("root", ["/home/them/project/", "C:/Users/them/", "C:\\Users\\them\\"])

@@ -620,16 +620,13 @@ def test_a_point_that_is_not_known_well_tells_less(room: World) -> None:
     assert worse == pytest.approx(hopeless, rel=1e-3)
 
 
-def test_what_is_known_of_unknowns_beside_the_matches_counts() -> None:
-    """Of two unknowns that move projections alike, one is known within 0.1: the other then has that and the noise."""
+def test_unknowns_that_move_projections_alike_have_no_covariance() -> None:
     rng = np.random.default_rng(0)
     of_one = rng.normal(size=(400, 2, 1))
     of_unknowns = np.concatenate([of_one, of_one], axis=2)
     errors, nothing = np.full(400, np.sqrt(2.0)), np.zeros((400, 2, 2))
     assert least_squares_covariance(of_unknowns, errors, nothing) is None
-    covariance = least_squares_covariance(of_unknowns, errors, nothing, np.diag([0.0, 100.0]))
     alone = least_squares_covariance(of_one, errors, nothing)
-    np.testing.assert_allclose(covariance[0, 0], alone[0, 0] + 0.01, rtol=1e-6)
     # Points without a covariance tell nothing.
     nothing[:200] = np.nan
     half = least_squares_covariance(of_one, errors, nothing)

@@ -46,9 +46,7 @@ class World:
     queries: list[tuple[Query, list[References]]]
     true: Floats
 
-    def answer(
-        self, index: int, predictor: object, session: Session
-    ) -> tuple[FeedForwardLocalizer, FeedForwardAnswer]:
+    def answer(self, index: int, predictor: object, session: Session) -> tuple[FeedForwardLocalizer, FeedForwardAnswer]:
         localizer = FeedForwardLocalizer(self.map, session, predictor)  # type: ignore[arg-type]
         return localizer, localizer.answer(*self.queries[index])
 
@@ -184,6 +182,36 @@ def test_a_wrong_scale_of_one_image_is_in_the_covariance(world: World) -> None:
     if found.world_from_rig is not None:
         arm = np.linalg.norm(world.map.world_from_cams[far, :3, 3] - found.world_from_rig[:3, 3])
         assert found.position_std > 0.09 * arm
+
+
+@pytest.mark.parametrize("factor", [0.95, 1.02])
+def test_triangulated_points_tell_how_wrong_the_depth_of_a_sensor_is(world: World, factor: float) -> None:
+    """All depth maps are too long by a factor; images with points of known place tell of all others."""
+    seen = FeedForwardLocalizer(world.map, world.map_session, world.predictor).seen_depth
+    features = world.pnp.matcher.mapped[0].features
+    rows, points = [], []
+    for image, name in enumerate(world.map.image_names):
+        keypoints = features[name].keypoints.astype(np.float64)
+        depth_m = seen(image).at(keypoints)
+        few = np.flatnonzero(np.isfinite(depth_m))[:12]
+        rows.append(np.stack([np.full(len(few), image), few]))
+        in_cam = lifted(world.map.cameras[image], keypoints[few], depth_m[few])
+        points.append(geometry.transform(world.map.world_from_cams[image], in_cam))
+    images, keypoint = np.concatenate(rows, axis=1)
+    known = replace(
+        world.map, points=np.concatenate(points), colors=np.zeros((len(images), 3), np.uint8), obs_image=images,
+        obs_keypoint=keypoint, obs_point=np.arange(len(images)), noise_px=np.ones(len(images), np.float32),
+    )  # fmt: skip
+    pnp = PnpLocalizer([MappedFeatures(known, features)])
+    shares = []
+    for index, (query, references) in enumerate(world.queries):
+        lifter = DepthLifter(pnp, lambda image: replace(seen(image), depth_m=factor * seen(image).depth_m))
+        found = lifter.localize(query, [References.of(some.images[-2:]) for some in references])
+        if found is not None and np.isfinite(found.position_std):
+            shares.append(world.error(index, found)[1] / found.position_std)
+    assert len(shares) >= 3
+    assert max(shares) < 2
+    assert np.median(shares) > 0.3
 
 
 def test_without_depth_nothing_is_lifted(world: World) -> None:

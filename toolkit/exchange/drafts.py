@@ -213,6 +213,7 @@ class Draft(Options):
         """
         self._take_times()
         self._place_world()
+        self._compare_worlds()
         if held is None:
             frames = [image.frame for image in sorted(self.images, key=lambda image: image.name)]
             held = every_nth(list(dict.fromkeys(frames)), self.hold_out)
@@ -275,6 +276,17 @@ class Draft(Options):
         self.record["unit"] = "m" if not self.poses or "meters" in self.record else None
         if is_aligned and self.poses:
             self._align()
+
+    def _compare_worlds(self) -> None:
+        """Note the other sessions of the capture whose world another tool changed otherwise."""
+        if "up" in self.record:  # it was placed by GPS or positions
+            self.record.pop("applied", None)
+        for path in sorted(self.session.parent.glob(f"*/{IMPORT_RECORD}")):
+            name, other = path.parents[1].name, read_json(path)
+            differ = bool(self.poses and other.get("poses")) and other.get("applied") != self.record.get("applied")
+            if differ and name != self.session.name:
+                note = f"applied_transform of {name} is another or none, so its world is another"
+                self.notes.append(f"{note}. Give --undo-applied to the import that has one")
 
     def _align(self) -> None:
         """Move the poses to the world of known camera centers, or of GPS: z is up, in meters, if they tell it."""

@@ -30,9 +30,9 @@ import os
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatch
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import cv2
@@ -436,8 +436,11 @@ def _read_table(path: Path) -> pd.DataFrame:
     column `problem`, why the pose of a row is none.
     """
     if _is_transforms(path):
+        _read_transforms(path)
         raise CaptureError(f"{path}: not a CSV table. Import it by {COMMAND} import transforms.")
     text = read_text(path)
+    if text.startswith("# kapture format"):
+        raise _of_tool(path, "kapture, `kapture_export_colmap.py`")
     first = next((line for line in text.splitlines() if line.strip()), "").split()
     of_hloc = len(first) > 4 and first[1] in pycolmap.CameraModelId.__members__
     rows = _read_hloc_list(text) if of_hloc else read_csv(path)
@@ -524,8 +527,6 @@ def import_transforms(
     options.setdefault("axes", "opengl")
     draft = start(capture, device, split, path.parent, **options)
     content = _read_transforms(path)
-    held = _named(content, "val_filenames", "test_filenames")
-    own_split = own_split and bool(held) and split == "map" and not draft.hold_out
     frames: dict[str, _TransformsFrame] = {}
     applied = _applied(path, content)
     again: dict[str, CaptureError] = {}
@@ -538,12 +539,16 @@ def import_transforms(
         first = frames.setdefault(frame.name, frame)
         if frame.values != first.values:
             again[frame.name] = frame.error("file_path", f"that of frame {first.number} again", "one frame per image")
-    trained = _named(content, "train_filenames") or {frame.listed for frame in frames.values()} - held
+    in_lists = [_named(content, *keys) for keys in (("val_filenames", "test_filenames"), ("train_filenames",))]
+    meant = _frames_of(set().union(*in_lists), frames)
+    held, trained = ({meant[name] for name in names if name in meant} for names in in_lists)
+    trained = trained if in_lists[1] else set(frames) - held
+    own_split = own_split and bool(held) and split == "map" and not draft.hold_out
     for name, frame in sorted(frames.items()):
         try:
             if name in again:
                 raise again[name]
-            if own_split and frame.listed not in held | trained:
+            if own_split and name not in held | trained:
                 raise CaptureError("it is in none of train_filenames, val_filenames and test_filenames")
             pose = frame.world_from_named()
             pose = _undone(pose, *applied) if undo_applied else pose
@@ -555,15 +560,34 @@ def import_transforms(
         draft.notes.append("map and queries: train_filenames, and val_filenames and test_filenames of the file")
     elif held and split == "map":
         draft.notes.append(f"val_filenames and test_filenames ({len(held)} images) of the file are not used")
+    if split == "map" and (loose := [name for name, frame in meant.items() if name != frames[frame].listed]):
+        names = f"{loose[0]!r} is {frames[meant[loose[0]]].listed!r}"
+        draft.notes.append(f"{len(loose)} names in these lists match but for their extensions, as {names}")
+    if split == "map" and (missing := sorted(set().union(*in_lists) - set(meant))):
+        draft.notes.append(f"{len(missing)} names in these lists are of no frame, or of several, as {missing[0]!r}")
     if found := sum(frame.from_elsewhere for frame in frames.values()):
         draft.notes.append(FROM_ELSEWHERE.format(found))
     turn, scale = applied
     if not (np.array_equal(turn, np.eye(4)) and scale == 1):
+        draft.record |= {} if undo_applied else {"applied": [*turn[:3].ravel().tolist(), scale]}
         world = "that of the file's input" if undo_applied else "the file's, turned from that of its input"
         other = "" if undo_applied else ". For the input's, as of a COLMAP model beside it, give --undo-applied"
         draft.notes.append(f"applied_transform, applied_scale {scale:g}: the world is {world}{other}")
-    of_file = {name for name, frame in frames.items() if frame.listed in held}
-    return draft.finish(of_file if own_split else every_nth(sorted(frames), draft.hold_out))
+    return draft.finish(held if own_split else every_nth(sorted(frames), draft.hold_out))
+
+
+_OTHER_TOOLS = {
+    "shots": "OpenSfM, `opensfm export_colmap`",
+    "sfm_data_version": "OpenMVG, `openMVG_main_openMVG2Colmap`",
+}
+"""Tools that write a JSON file with a key, and their commands that export a COLMAP model."""
+
+
+def _of_tool(path: Path, tool: str) -> CaptureError:
+    """Return the error of a file of another tool, given with its command that exports a COLMAP model."""
+    name, command = tool.split(", ")
+    do = f"Export a COLMAP model by {command}, and import that by `{COMMAND} import colmap`."
+    return CaptureError.at(path, f"a file of {name}", "a table, or a transforms.json", do)
 
 
 def _read_transforms(path: Path) -> dict[str, Any]:
@@ -572,6 +596,10 @@ def _read_transforms(path: Path) -> dict[str, Any]:
         content = json.loads(path.read_bytes())  # also UTF-16, and with a byte-order mark
     except (OSError, ValueError, RecursionError) as error:
         raise CaptureError(f"{path}: cannot be read ({error}). {expected}") from None
+    for entry in content[:1] if isinstance(content, list) else [content]:
+        for key, tool in _OTHER_TOOLS.items():
+            if isinstance(entry, dict) and key in entry:
+                raise _of_tool(path, tool)
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not any(isinstance(frame, dict) for frame in frames):
         found = f"keys {', '.join(map(repr, content))[:100]}" if isinstance(content, dict) else repr(content)[:100]
@@ -584,6 +612,24 @@ def _named(content: Mapping[str, Any], *keys: str) -> set[str]:
     """Return the images in lists of the file, as they are written there."""
     lists = (content.get(key) for key in keys)
     return {name for names in lists if isinstance(names, list) for name in names if isinstance(name, str)}
+
+
+def _frames_of(names: Iterable[str], frames: Mapping[str, "_TransformsFrame"]) -> dict[str, str]:
+    """Return the frames that names in lists of the file mean: that of the same path, else the only one of the same path
+    but for its extension.
+    """
+    same = {frame.listed: name for name, frame in frames.items()}
+    alike: dict[str, list[str]] = {}
+    for name, frame in frames.items():
+        alike.setdefault(_without_suffix(frame.listed), []).append(name)
+    fitting = {name: [same[name]] if name in same else alike.get(_without_suffix(name), []) for name in sorted(names)}
+    return {name: found[0] for name, found in fitting.items() if len(found) == 1}
+
+
+def _without_suffix(image: str) -> str:
+    """Return an image's path without its extension, with forward slashes."""
+    path = PurePosixPath(image.replace("\\", "/"))
+    return str(path.with_suffix("") if path.suffix.lower() in READ_SUFFIXES else path)
 
 
 def _applied(path: Path, content: Mapping[str, Any]) -> tuple[Floats, float]:

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from scipy.special import chdtr, expit
 
 from toolkit import geometry
-from toolkit.alignment.robust import Bools
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import PnpSettings
 from toolkit.pose.base import (
@@ -69,7 +68,7 @@ LIMITS = (0.5, 5.0)  # meters, degrees: a pose within them is correct
 MARGIN = 1.5  # factor on stated deviations, which are right only to about as much
 
 # Of the search for the pose
-PNP_FORMAT = 10
+PNP_FORMAT = 11
 """Version of the poses. Increase when the same settings and files give other poses, or they are written otherwise."""
 FIRST_REFERENCES = {2: 200, 4: 100}
 """Number of references per image to match first -> independent inliers that their pose needs to be kept. The next
@@ -510,7 +509,7 @@ class PnpLocalizer(Localizer):
         images = np.unique(np.concatenate([retrieved.images for retrieved in references]))
         seen = self.map.images_seeing(np.unique(all_matches.point[agreeing]))[images]
         used = [int(images[index]) for index in np.argsort(-seen, kind="stable") if seen[index]]
-        covariance = self._covariance(query, rig_from_world, guided, np.isin(guided.rows(), inliers.rows()))
+        covariance = self._covariance(query, rig_from_world, guided, inliers)
         estimate = QueryResult(
             Status.OK,
             world_from_rig=geometry.invert(rig_from_world),
@@ -562,14 +561,13 @@ class PnpLocalizer(Localizer):
             view_pixels=np.concatenate([np.zeros((0, 2)), *(pixels for _, _, pixels in views)]),
         )
 
-    def _covariance(
-        self, query: RigQuery, rig_from_world: Floats, guided: Matches, found_twice: Bools
-    ) -> Floats | None:
+    def _covariance(self, query: RigQuery, rig_from_world: Floats, guided: Matches, inliers: Matches) -> Floats | None:
         """Return the covariance (6, 6) of a pose estimated from guided matches; None if it is undefined.
 
         Guided matches were searched near the pose, so their errors are small wherever it is. Only those that were also
-        found by descriptors alone (`found_twice`) measure the spread of the errors; the others count for less.
+        found by descriptors alone, `inliers`, measure the spread of the errors; the others count for less.
         """
+        found_twice = np.isin(guided.rows(), inliers.rows())
         of_pose, of_point = query.jacobians(rig_from_world, guided, self.map.points)
         errors = query.errors_px(rig_from_world, guided, self.map.points)
         weights, noise = np.where(found_twice, 1.0, GUIDED_WEIGHT), self._noise_of_points(query, guided, of_point)

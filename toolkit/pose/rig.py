@@ -142,9 +142,13 @@ class RigQuery:
 
     def num_cells(self, matches: Matches) -> int:
         """Return the number of cells, of all images, with a match."""
+        return len(np.unique(self.cells(matches)))
+
+    def cells(self, matches: Matches, along: int = CELLS) -> Ints:
+        """Return the cells (K,) of matches, as numbers; an image has `along` columns and rows of them."""
         sizes = np.array([(camera.width, camera.height) for camera in self.cameras])
-        cells = np.clip(CELLS * matches.pixels / sizes[matches.camera], 0, CELLS - 1).astype(np.int64)
-        return len(np.unique(np.column_stack([matches.camera, cells]), axis=0))
+        column, row = np.clip(along * matches.pixels / sizes[matches.camera], 0, along - 1).astype(np.int64).T
+        return np.asarray((matches.camera * along + row) * along + column, np.int64)
 
     def pixels(self, camera: Ints, keypoint: Ints, kind: int) -> Floats:
         """Return the pixels (K, 2) of keypoints of one kind, given by camera (K,) and index (K,)."""
@@ -311,11 +315,7 @@ class RigQuery:
 
 
 def least_squares_covariance(
-    jacobian: Floats,
-    errors_px: Floats,
-    noise_px2: Floats,
-    prior_information: Floats | None = None,
-    weights: Floats | None = None,
+    jacobian: Floats, errors_px: Floats, noise_px2: Floats, weights: Floats | None = None
 ) -> Floats | None:
     """Return the covariance (U, U) of a least squares estimate of U unknowns from K projections; None if undefined.
 
@@ -328,7 +328,6 @@ def least_squares_covariance(
         errors_px: (K,) reprojection errors.
         noise_px2: (K, 2, 2), covariance of each projection due to its point, square pixels. Projections whose
             covariance is not finite are left out.
-        prior_information: (U, U), information on the unknowns from other sources.
         weights: (K,), at most 1, of the information of the projections. The spread of the errors is that of the
             projections of weight 1. None: all have it.
     """
@@ -340,12 +339,11 @@ def least_squares_covariance(
     jacobian, noise_px2 = jacobian[valid] * np.sqrt(weights[valid])[:, None, None], noise_px2[valid]
     # Two coordinates per point, six parameters of the pose.
     variance = float((measured**2).sum()) / max(2 * len(measured) - 6, 1)
-    prior = np.zeros((jacobian.shape[2],) * 2) if prior_information is None else prior_information
-    information = np.einsum("oki,okj->ij", jacobian, jacobian) + variance * prior
+    information = np.einsum("oki,okj->ij", jacobian, jacobian)
     if not np.isfinite(information).all() or np.linalg.cond(information) > 1e14:
         return None
     noise = noise_px2 + variance * np.eye(2)
-    middle = np.einsum("oki,okl,olj->ij", jacobian, noise, jacobian) + variance**2 * prior
+    middle = np.einsum("oki,okl,olj->ij", jacobian, noise, jacobian)
     inverse = np.linalg.inv(information)
     return np.asarray(inverse @ middle @ inverse, np.float64)
 

@@ -3,17 +3,17 @@ with prediction: match alone, near the predicted pose, and with depth, and keep 
 
 Depth comes from the capture's depth maps, else from the network that predicted the map image. A scale error in the
 depth of an image scales its points about its camera and moves the query toward the image or away from it. If all
-matches are with one image, no reprojection error shows this. So the covariance treats that scale as an unknown.
+matches are with one image, no reprojection error shows this. So the covariance includes the uncertainty of that scale.
 """
 
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from toolkit import geometry
-from toolkit.alignment.robust import Bools
 from toolkit.alignment.similarity import DEPTH_NOISE
 from toolkit.capture import Session
 from toolkit.capture.depths import SeenDepth, lifted
@@ -22,19 +22,21 @@ from toolkit.manifest import LocalizeSettings, PnpSettings
 from toolkit.mapping.local_map import LocalMap
 from toolkit.pose.base import Localizer, Prior, Query, QueryInput, QueryResult, References, Status, agree
 from toolkit.pose.map_matching import MAX_MAP_FEATURES, MappedFeatures
-from toolkit.pose.pnp import GUIDED_WEIGHT, PnpLocalizer, PnpMatches
-from toolkit.pose.rig import Matches, RigQuery, least_squares_covariance
+from toolkit.pose.pnp import PnpLocalizer, PnpMatches
+from toolkit.pose.rig import CELLS, Matches, RigQuery
 from toolkit.prediction.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer, QueryPrediction
 from toolkit.threads import fixed_sums
 
 log = logging.getLogger(__name__)
-DEPTH_MAP_STD = 0.01  # relative standard deviation of the scale of a depth map
+DEPTH_MAP_STD = 0.01  # relative standard deviation of the scale of a depth map, before it is measured
+MEASURED = 16  # map images, those with the most triangulated points, whose depth maps tell how wrong their scales are
 LEAST_LIFTED = 20  # features of a map image with depth from its depth maps; with fewer, predicted depth is used
 LEAST_RATIOS = 10  # fewest depth ratios that give the predicted depth of an image its own scale
 MOST_RATIOS = 10  # most ratios that count as independent, as the depth errors of networks are spatially correlated
 MAX_RATIO_SPREAD = 0.25  # relative spread of the ratios of an image above which its predicted depth is wrong
 MOST_FEATURES = 4096  # of a map image, for depth maps alone: with fewer, those of triangulated points hide the others
 CONTRADICTION = 3.0  # standard deviations per axis above which a pose contradicts the predicted camera
+TINY = float(np.finfo(float).tiny)
 TIE = 0.8  # share of the lifted pose's matches above which the pose from matching alone is kept
 
 
@@ -46,6 +48,8 @@ class Depth:
     """(n,) NaN where unknown."""
     scale_std: float
     """Relative standard deviation of their common scale."""
+    common_std: float = 0.0
+    """The part of it that is common to the images, relative."""
     predicted: bool = False
     measured: bool = True
     """Whether the scale was checked against points of known depth in the image."""
@@ -159,19 +163,41 @@ class DepthLifter:
         )
         return LiftedMap(part, triangulated, np.concatenate([np.full(len(triangulated), -1), lifted_from]), depths)
 
-    def _fits(self, image: int, seen: SeenDepth) -> bool:
-        """Tell whether depth maps agree with the triangulated points of an image, if it has enough of them."""
+    def _log_scale(self, image: int, seen: SeenDepth) -> float:
+        """Return the logarithm of the depth of depth maps, divided by that of the triangulated points of an image, in
+        the median; NaN if it has too few of them.
+        """
         local_map = self._first.map
         keypoints, points = local_map.observations(image)
         depth_m = seen.at(self._first.features[local_map.image_names[image]].keypoints[keypoints])
         ratios = depth_m / geometry.transform(local_map.cams_from_world[image], local_map.points[points])[:, 2]
         ratios = ratios[ratios > 0]
-        if len(ratios) < LEAST_RATIOS or abs(np.log(middle := float(np.median(ratios)))) <= MAX_RATIO_SPREAD:
+        return float(np.log(np.median(ratios))) if len(ratios) >= LEAST_RATIOS else np.nan
+
+    @cached_property
+    def _scale_stds(self) -> tuple[float, float]:
+        """Relative standard deviation of the scale of a depth map of this map, and its part common to all of them.
+
+        Depth maps of a sensor share errors, so those of images with triangulated points tell of the others;
+        `DEPTH_MAP_STD`, half of it common, counts as one more of them.
+        """
+        seen = np.bincount(self._first.map.obs_image, minlength=len(self._first.map.image_names))
+        most = np.argsort(-seen, kind="stable")[:MEASURED]
+        errors = np.array([self._log_scale(image, self._seen_depth(image)) for image in most[seen[most] > 0].tolist()])
+        errors = errors[np.abs(errors) <= MAX_RATIO_SPREAD]
+        common = DEPTH_MAP_STD**2 / 2 + errors.sum() ** 2 / max(len(errors), 1)
+        variances = np.array([DEPTH_MAP_STD**2 + np.square(errors).sum(), common]) / (1 + len(errors))
+        return float(np.sqrt(variances[0])), float(np.sqrt(variances[1]))
+
+    def _fits(self, image: int, seen: SeenDepth) -> bool:
+        """Tell whether depth maps agree with the triangulated points of an image, if it has enough of them."""
+        log_scale = self._log_scale(image, seen)
+        if not abs(log_scale) > MAX_RATIO_SPREAD:
             return True
         if not self._warned:
             self._warned = True
-            found = f"its depth map is not used: {middle:.3g} of the depth of its map points, in the median"
-            log.warning("%s: %s", local_map.image_names[image], found)
+            found = f"its depth map is not used: {np.exp(log_scale):.3g} of the depth of its map points, in the median"
+            log.warning("%s: %s", self._first.map.image_names[image], found)
         return False
 
     def _depth(self, image: int, xy: Floats, predicted: tuple[CameraAnswer, int] | None) -> Depth | None:
@@ -179,7 +205,7 @@ class DepthLifter:
         seen = self._seen_depth(image)
         depth_m = seen.at(xy)
         if np.isfinite(depth_m).sum() >= LEAST_LIFTED and self._fits(image, seen):
-            return Depth(depth_m, DEPTH_MAP_STD)
+            return Depth(depth_m, *self._scale_stds)
         if predicted is None:
             return None
         answer, view = predicted
@@ -199,7 +225,9 @@ class DepthLifter:
             std = float(np.hypot(answer.alignment.scale_std, DEPTH_NOISE))
         else:
             return None
-        return Depth(scale * answer.prediction.depth_at(view, xy), max(std, DEPTH_MAP_STD), True, measured)
+        std = max(std, DEPTH_MAP_STD)
+        common_std = 0.0 if measured else std / np.sqrt(2)  # they share the scale of the alignment
+        return Depth(scale * answer.prediction.depth_at(view, xy), std, common_std, True, measured)
 
 
 def lifts(settings: LocalizeSettings, map_session: Session) -> bool:
@@ -237,14 +265,13 @@ class _LiftedLocalizer(PnpLocalizer):
         super().__init__([mapped], settings, seed)
         self._lifted_map = lifted_map
 
-    def _covariance(
-        self, query: RigQuery, rig_from_world: Floats, guided: Matches, found_twice: Bools
-    ) -> Floats | None:
+    def _covariance(self, query: RigQuery, rig_from_world: Floats, guided: Matches, inliers: Matches) -> Floats | None:
+        covariance = super()._covariance(query, rig_from_world, guided, inliers)
         lifted_map, local_map = self._lifted_map, self._lifted_map.local_map
         source = lifted_map.image[guided.point]
         images = np.unique(source[source >= 0])
-        if not len(images):
-            return super()._covariance(query, rig_from_world, guided, found_twice)
+        if covariance is None or not len(images):
+            return covariance
         of_pose, of_point = query.jacobians(rig_from_world, guided, local_map.points)
         of_scales = np.zeros((len(guided), 2, len(images)))
         for number, image in enumerate(images):
@@ -252,29 +279,44 @@ class _LiftedLocalizer(PnpLocalizer):
             # A relative change s of the scale moves a point by s times its offset from the camera of the image.
             offset = local_map.points[guided.point[rows]] - local_map.world_from_cams[image, :3, 3]
             of_scales[rows, :, number] = np.einsum("okj,oj->ok", of_point[rows], offset)
-        noise = self._noise_of_points(query, guided, of_point)
-        noise[source >= 0] = 0  # the reprojection error of a lifted point already includes its own noise
-        information = np.zeros((6 + len(images),) * 2)
-        information[6:, 6:] = np.linalg.inv(_scale_covariance([lifted_map.depths[int(image)] for image in images]))
-        # Rotations, translations and scales have similar magnitudes, so one condition number covers all of them.
-        covariance = least_squares_covariance(
-            np.concatenate([of_pose, of_scales], axis=2),
-            query.errors_px(rig_from_world, guided, local_map.points),
-            noise,
-            information,
-            np.where(found_twice, 1.0, GUIDED_WEIGHT),
-        )
-        return None if covariance is None else covariance[:6, :6]
+        # Of the pose, by a pixel of each match.
+        moves: Floats = np.linalg.pinv(of_pose.reshape(-1, 6)).reshape(6, -1, 2).astype(np.float64)
+        # The pose takes the scales as they are, so it moves by all of their errors.
+        moved = np.einsum("akc,kcj->aj", moves, of_scales)
+        scales = _scale_covariance([lifted_map.depths[int(image)] for image in images])
+        excess = self._excess_of_errors(query, rig_from_world, guided, inliers, moves[3:])
+        return np.asarray(excess * covariance + moved @ scales @ moved.T, np.float64)
+
+    def _excess_of_errors(
+        self, query: RigQuery, rig_from_world: Floats, guided: Matches, inliers: Matches, moves: Floats
+    ) -> float:
+        """Return how much larger the variance of a pose is than with independent errors as small as those of guided
+        matches.
+
+        Matches by descriptors tell how large errors are; guided matches are not kept if depth is too noisy. Points near
+        each other share errors of depth: this is as the variance if errors are clustered by cells (Liang and Zeger
+        1986, "Longitudinal data analysis using generalized linear models"). `moves` (3, K, 2) are those of the position
+        by a pixel of each guided match.
+        """
+        points = self._lifted_map.local_map.points
+        kept = inliers[np.isin(inliers.rows(), guided.rows())]
+        found, small = (np.mean(query.errors_px(rig_from_world, some, points) ** 2) + TINY for some in (inliers, kept))
+        pulls = np.einsum("akc,kc->ak", moves, guided.pixels - query.projected(rig_from_world, guided, points))
+        cells, of_match = np.unique(query.cells(guided, 2 * CELLS), return_inverse=True)
+        together = np.stack([np.bincount(of_match, along) for along in pulls])
+        clustered = np.sum(together**2) / (np.sum(pulls**2) + TINY) * len(cells) / max(len(cells) - 3, 1)
+        return max(1.0, float(found / small)) * max(1.0, float(clustered))
+
+    def _noise_of_points(self, query: RigQuery, matches: Matches, of_point: Floats) -> Floats:
+        noise = super()._noise_of_points(query, matches, of_point)
+        noise[self._lifted_map.image[matches.point] >= 0] = 0  # their reprojection errors include it already
+        return noise
 
 
 def _scale_covariance(depths: Sequence[Depth]) -> Floats:
-    """Return the covariance (J, J) of the relative errors of the depth scales of J images.
-
-    Predicted depths of unmeasured scale share the scale of the alignment: half of their variance is common.
-    """
-    stds = np.array([depth.scale_std for depth in depths])
-    common = stds * np.array([not depth.measured for depth in depths]) / np.sqrt(2)
-    return np.diag(stds**2 - common**2) + np.outer(common, common)
+    """Return the covariance (J, J) of the relative errors of the depth scales of J images."""
+    stds, common = np.array([(depth.scale_std, depth.common_std) for depth in depths]).T
+    return np.asarray(np.diag(stds**2 - common**2) + np.outer(common, common), np.float64)
 
 
 def _predictions(answer: FeedForwardAnswer) -> dict[int, tuple[CameraAnswer, int]]:
