@@ -862,9 +862,9 @@ class _UnknownFocal:
             result = self.locate(focal_px)
         text = f"focal length {focal_px:.0f} px, {'which fits its matches' if told else self.origin}"
         others = (focal_px * FOCAL_DOUBT, focal_px / FOCAL_DOUBT)
-        if result.status == Status.OK and not told and not all(self.locate(other).misfit for other in others):
+        if result.status == Status.OK and not all(self.locate(other).misfit for other in others):
             result = replace(result, status=Status.LOW_CONFIDENCE, reason=CAMERA)
-            text += ", and the matches do not tell it"
+            text += ", as others do" if told else ", and the matches do not tell it"
         return replace(result, remark="; ".join(filter(None, [text, result.remark]))), focal_px if told else None
 
 
