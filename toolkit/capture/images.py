@@ -54,6 +54,7 @@ _MASK_DEPTH = 4  # largest number of folders and files in the path of an image b
 NO_FILE = "no such file"
 EXIF_CAMERA = (0x010F, 0x0110, _FOCAL_MM, _FOCAL_35MM)
 """EXIF tags that distinguish cameras: make, model and focal lengths."""
+CROPPED = " of the whole image, which was cropped"
 _FILM_DIAGONAL_MM = float(np.hypot(36, 24))
 CAMERA_TYPES = ("camera", "depth")  # sensor types with intrinsics; only `camera` takes photographs
 WIDE = ("FISHEYE", "FOV", "EUCM")  # ends of the names of models for fields of view of 180 degrees and more
@@ -376,7 +377,7 @@ def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
         such_as = f"'SIMPLE_PINHOLE,{width},{height},FOCAL_PX,{width / 2:g},{height / 2:g}'"
         options = f"--camera 'MODEL,W,H,...', such as {such_as}, with --cameras, or in the table"
         raise ImageError(f"no focal length in EXIF: give the intrinsics with {options}")
-    how += " of the whole image, which was cropped" if cropped else ""
+    how += CROPPED if cropped else ""
     params = [float(focal_px), width / 2, height / 2]
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
     return camera, f"a guess from EXIF ({how}), without distortion"
