@@ -2,6 +2,7 @@
 
 import os
 import struct
+import sys
 import threading
 import time
 import zlib
@@ -41,6 +42,25 @@ def test_reads_rgb(tmp_path: Path, picture: np.ndarray, name: str) -> None:
     assert (image.shape, image.dtype) == ((48, 80, 3), np.uint8)
     assert np.abs(image[10:15, 5:30].astype(int) - [200, 0, 0]).max() <= 4
     assert np.abs(image[5:10, 50:70].astype(int) - [0, 0, 100]).max() <= 4
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_heic_is_read_with_its_package(
+    tmp_path: Path, picture: np.ndarray, monkeypatch: pytest.MonkeyPatch, installed: bool
+) -> None:
+    """`import` converted HEIC to PNG; a query of `localize` and `localize_image` was no known image."""
+    pytest.importorskip("pillow_heif").register_heif_opener()
+    path = tmp_path / "a.heic"
+    Image.fromarray(picture).save(path, quality=98)
+    if not installed:
+        monkeypatch.setitem(sys.modules, "pillow_heif", None)
+        for read in (stored_size, read_image):
+            with pytest.raises(ImageError, match="HEIC is not read: pip install pillow-heif"):
+                read(path)
+        return
+    assert stored_size(path) == (80, 48)
+    assert np.abs(read_image(path)[10:15, 5:30].astype(int) - [200, 0, 0]).max() <= 12
+    assert read_image(path, gray=True).shape == (48, 80)
 
 
 def test_gray_and_color_files_read_as_asked(tmp_path: Path, picture: np.ndarray) -> None:

@@ -9,8 +9,10 @@ import pytest
 
 from toolkit.capture import Capture, Session, Trajectory, write_session
 from toolkit.capture.images import turned_from_cam
+from toolkit.capture.session import IMPORT_RECORD
 from toolkit.capture.upright import estimate_world_up, quarter_turns, up_of_cameras
 from toolkit.errors import CaptureError
+from toolkit.files import write_text
 from toolkit.geometry import invert, make_pose
 
 # Simulated captures: a world with z up, then turned as a whole
@@ -137,6 +139,11 @@ def test_a_drone_that_looks_straight_down_does_not_tell_where_up_is(write: Write
     assert not up.known
     assert up.direction.tolist() == [0, 0, 1]
     assert "straight down, if z is up" in up.reason
+    session = write("ios_map", _frames("r/cam", 0, pitch=-88, headings=headings, noise=2))
+    for made, known in (("by the cameras", False), ("by GPS in EXIF", True)):
+        write_text(session.path / IMPORT_RECORD, f'{{"up": "z, {made}"}}')
+        assert estimate_world_up([session]).known == known
+        assert made in estimate_world_up([session]).reason or not known
     poses = np.array([pose for _, pose in _frames("r/cam", 0, pitch=-88, headings=headings, noise=2)])
     assert up_of_cameras(poses).tolist() == [0, 0, 1]
 

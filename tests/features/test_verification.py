@@ -38,3 +38,14 @@ def test_random_matches_are_none() -> None:
 def test_one_point_matched_many_times_is_no_motion() -> None:
     a, b = np.full((50, 2), 100.0), np.full((50, 2), 200.0)
     assert not len(epipolar_matches((960, 640), a, (960, 640), b, np.ones(50)))
+
+
+@pytest.mark.parametrize("seed", [51, 145, 304])
+def test_few_matches_on_a_small_strip_are_no_motion(seed: int) -> None:
+    """OpenCV's estimate ended in an assertion: 11 matches of nine points at the edges of two images, and 3 others."""
+    rng = np.random.default_rng(seed)
+    strip = np.column_stack([1343 + rng.uniform(0, 120, 9), 843 + rng.uniform(0, 40, 9)])
+    moved = strip @ np.array([[1.0, 0.0], [0.3, 1.0]]) - 800 + rng.normal(size=(9, 2)) * 0.5
+    mixed = np.r_[:9, :2][rng.permutation(11)]
+    a, b = (np.r_[points[mixed], rng.uniform(0, 900, (3, 2))] for points in (strip, moved))
+    assert not len(epipolar_matches((1600, 900), a, (1600, 900), b, np.ones(14)))

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import PIL.Image
 import pycolmap
 import pytest
 from numpy.typing import NDArray
@@ -166,16 +167,17 @@ def test_a_query_that_nothing_can_help_is_not_asked_again(lacks: str) -> None:
 
 
 class OfOneCamera:
-    """A map in which images (H, W) of value 1 tell that the true focal length is 500 px, those of value 0 nothing."""
+    """A map in which images (H, W) of value 1 tell that the true focal length is 500 px, those of value 0 nothing, and
+    those of value 2 only that it is no small one."""
 
     session = SimpleNamespace(sensors=pd.DataFrame({"sensor_type": [], "sensor_id": []}))
 
-    def query(self, image: Any, camera: pycolmap.Camera, *_: Any) -> tuple[float, bool]:
-        return camera.mean_focal_length(), bool(np.asarray(image).max())
+    def query(self, image: Any, camera: pycolmap.Camera, *_: Any) -> tuple[float, int]:
+        return camera.mean_focal_length(), 1 if isinstance(image, Path) else int(np.asarray(image).max())
 
-    def locate(self, query: tuple[float, bool], near: Any) -> QueryResult:
+    def locate(self, query: tuple[float, int], near: Any) -> QueryResult:
         focal_px, tells = query
-        true = abs(focal_px - 500) < 1
+        true = abs(focal_px - 500) < 1 or (tells == 2 and focal_px > 300)
         result = replace(OK if true or not tells else DOUBTED, num_inliers=50)
         return result if true or not tells else replace(result, focals_px=(500.0,))
 
@@ -191,3 +193,22 @@ def test_images_of_one_camera_share_what_one_of_them_tells_of_its_focal_length()
     assert results[3].status_text.startswith("failed: ImageError")
     alone = localize_images(OfOneCamera(), [telling_nothing])  # type: ignore[arg-type]
     assert alone[0].status_text == "low_confidence: camera?"
+
+
+def test_a_focal_length_that_fits_as_others_do_is_not_ok() -> None:
+    """A photograph squeezed to half of its height was ok with a focal length three times too long, 13 units away."""
+    (result,) = localize_images(OfOneCamera(), [np.full((48, 64), 2, np.uint8)])  # type: ignore[arg-type]
+    assert result.status_text == "low_confidence: camera?"
+    assert result.remark == "focal length 500 px, which fits its matches, as other intrinsics do"
+
+
+@pytest.mark.parametrize(("side", "status"), [(64, "ok"), (128, "low_confidence: camera?")])
+def test_a_cropped_image_is_ok_only_if_the_matches_tell_its_principal_point(
+    tmp_path: Path, side: int, status: str
+) -> None:
+    """A crop of a corner that kept its EXIF was ok 1.5 m and 19 degrees off."""
+    exif = PIL.Image.Exif()
+    exif.get_ifd(0x8769).update({0xA405: 35, 0xA002: side, 0xA003: 48})
+    PIL.Image.new("RGB", (64, 48)).save(tmp_path / "a.jpg", exif=exif)
+    (result,) = localize_images(OfOneCamera(), [tmp_path / "a.jpg"])  # type: ignore[arg-type]
+    assert result.status_text == status

@@ -39,6 +39,9 @@ _HEADER_READERS: dict[bytes, Callable[[Any], PIL.Image.Image]] = {
     b"\x89PNG\r\n\x1a\n": PngImagePlugin.PngImageFile,
     b"": PIL.Image.open,
 }
+_HEIC = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")  # brands of ISO files, ISO/IEC 23008-12
+CONVERT = "convert them to JPEG or PNG"
+HEIC_HOW = f"pip install pillow-heif, or {CONVERT}"
 _REDUCED = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2.IMREAD_REDUCED_COLOR_2}
 _CGROUPS = Path("/sys/fs/cgroup")  # file names differ between versions 2 and 1
 HEADER_ERRORS = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
@@ -51,6 +54,7 @@ _MASK_DEPTH = 4  # largest number of folders and files in the path of an image b
 NO_FILE = "no such file"
 EXIF_CAMERA = (0x010F, 0x0110, _FOCAL_MM, _FOCAL_35MM)
 """EXIF tags that distinguish cameras: make, model and focal lengths."""
+CROPPED = " of the whole image, which was cropped"
 _FILM_DIAGONAL_MM = float(np.hypot(36, 24))
 CAMERA_TYPES = ("camera", "depth")  # sensor types with intrinsics; only `camera` takes photographs
 WIDE = ("FISHEYE", "FOV", "EUCM")  # ends of the names of models for fields of view of 180 degrees and more
@@ -97,16 +101,32 @@ def stored_size(path: str | Path) -> tuple[int, int]:
 
 def open_lazily(stream: BinaryIO, most_pixels: float = MOST_PIXELS) -> PIL.Image.Image:
     """Return an image of which only the header is read yet. Raise one of `HEADER_ERRORS` if it has too many pixels."""
-    first = stream.read(8)
+    first = stream.read(12)
     stream.seek(0)
+    if _is_heic(first) and not heic_is_read():
+        raise ValueError(f"HEIC is not read: {HEIC_HOW}")
     image = next(read for start, read in _HEADER_READERS.items() if first.startswith(start))(stream)
     if image.width * image.height > most_pixels:
         raise ValueError(f"{image.width} x {image.height} pixels, more than {most_pixels:,}")
     return image
 
 
+def _is_heic(data: bytes) -> bool:
+    return data[4:8] == b"ftyp" and data[8:12] in _HEIC
+
+
+def heic_is_read() -> bool:
+    """Tell whether Pillow reads HEIC, with the optional package pillow-heif."""
+    try:
+        import pillow_heif
+    except ImportError:
+        return False
+    pillow_heif.register_heif_opener()
+    return True
+
+
 def decode(path: str | Path, flags: int, least_side: int | None = None, longest: int | None = None) -> NDArray[Any]:
-    """Return the pixels of an image file as OpenCV decodes it with `flags`.
+    """Return the pixels of an image file as OpenCV decodes it with `flags`; HEIC by Pillow, upright.
 
     Args:
         least_side, longest: see `read_image`; a JPEG is decoded at a smaller size that suffices. Both add to `flags`.
@@ -117,6 +137,10 @@ def decode(path: str | Path, flags: int, least_side: int | None = None, longest:
     data = read_file(path)
     size = 0, 0
     try:
+        if _is_heic(data):
+            gray = not flags & cv2.IMREAD_COLOR
+            pixels = np.asarray(open_lazily(BytesIO(data)).convert("L" if gray else "RGB"))
+            return pixels if gray else np.ascontiguousarray(pixels[..., ::-1])
         with suppress(*HEADER_ERRORS[:-1]):  # OpenCV decides whether it is an image
             size = open_lazily(BytesIO(data), np.inf).size
         if size[0] * size[1] > MOST_PIXELS:
@@ -127,7 +151,7 @@ def decode(path: str | Path, flags: int, least_side: int | None = None, longest:
             fitting = (flag for factor, flag in _REDUCED.items() if factor <= most and not np.any(np.mod(size, factor)))
             flags |= next(fitting, 0)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    except (ValueError, cv2.error, PIL.Image.DecompressionBombError) as error:
+    except (*HEADER_ERRORS, cv2.error) as error:
         raise ImageError(f"Image cannot be decoded ({getattr(error, 'err', error)}): {path}") from None
     if image is None:
         raise ImageError(f"Image cannot be decoded ({len(data)} bytes; expected a whole JPEG or PNG): {path}")
@@ -353,7 +377,7 @@ def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
         such_as = f"'SIMPLE_PINHOLE,{width},{height},FOCAL_PX,{width / 2:g},{height / 2:g}'"
         options = f"--camera 'MODEL,W,H,...', such as {such_as}, with --cameras, or in the table"
         raise ImageError(f"no focal length in EXIF: give the intrinsics with {options}")
-    how += " of the whole image, which was cropped" if cropped else ""
+    how += CROPPED if cropped else ""
     params = [float(focal_px), width / 2, height / 2]
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
     return camera, f"a guess from EXIF ({how}), without distortion"

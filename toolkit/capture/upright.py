@@ -17,9 +17,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from toolkit.capture.session import Capture, Rows, Session
+from toolkit.capture.session import IMPORT_RECORD, Capture, Rows, Session
 from toolkit.errors import CaptureError
-from toolkit.files import fingerprint
+from toolkit.files import fingerprint, read_json
 from toolkit.geometry import Floats, Ints, unit
 from toolkit.threads import fixed_sums
 
@@ -51,6 +51,8 @@ class WorldUp:
 def estimate_world_up(sessions: Sequence[Session]) -> WorldUp:
     """Estimate the up direction of a capture from the poses of its map sessions, which share one world.
 
+    It is z where the import of a session has made it so, by GPS or known positions.
+
     Cameras are held or mounted near a multiple of 90 degrees of roll, so one axis of each image is level for any pitch.
     Up is perpendicular to all level axes: the eigenvector with the smallest eigenvalue of the sum of their outer
     products, with less weight for tilted images (Huber 1981). Which axis is level is decided for each camera of a
@@ -69,6 +71,9 @@ def estimate_world_up(sessions: Sequence[Session]) -> WorldUp:
         names = ", ".join(session.id for session in sessions) or "none"
         fault = f"No image of the map sessions ({names}) has a pose, so the up direction cannot be estimated"
         raise CaptureError(f"{fault}: expected poses in trajectories.txt. Or set `world_up` in the manifest.")
+    for made in (str(read_json(session.path / IMPORT_RECORD).get("up")) for session in sessions):
+        if made.startswith("z, by ") and made != "z, by the cameras":
+            return WorldUp(np.array([0.0, 0.0, 1.0]), True, f"(0, 0, 1), {made.removeprefix('z, ')}")
     if _look_down_z(axes):
         reason = f"(0, 0, 1), a guess from {count} images that all look along -z: straight down, if z is up"
         return WorldUp(np.array([0.0, 0.0, 1.0]), False, reason)

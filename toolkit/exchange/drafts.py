@@ -27,6 +27,8 @@ import pycolmap
 
 from toolkit.capture import RAW_DATA, Session, Trajectory, parse_camera, write_session
 from toolkit.capture.images import (
+    CONVERT,
+    HEIC_HOW,
     NO_FILE,
     ORIENTATION,
     camera_text,
@@ -70,8 +72,6 @@ CONVERTED_SUFFIXES = (*READ_SUFFIXES[len(IMAGE_SUFFIXES) :], *HEIC_SUFFIXES, ".g
 PHOTOGRAPHS = (*IMAGE_SUFFIXES, *CONVERTED_SUFFIXES, ".dng", ".cr2", ".nef", ".arw")
 """Formats of photographs, read or not."""
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-CONVERT = "convert them to JPEG or PNG"
-HEIC_HOW = f"pip install pillow-heif, or {CONVERT}"
 PLACING = ("link", "copy")
 EXIF = "exif"
 """What is given for a table of GPS fixes if the images have them."""
@@ -623,8 +623,6 @@ class Draft(Options):
             return "its name is not UTF-8: rename it"
         if is_bad_name(image.name):
             return f"the capture format cannot hold this name, expected {EXPECTED_NAME}"
-        if image.name.lower().endswith(HEIC_SUFFIXES) and not heic_is_read():
-            return f"HEIC is not read: {HEIC_HOW}"
         try:
             size, exif = read_header(self.source(image.name))
         except ImageError as error:
@@ -774,16 +772,6 @@ def walk_files(folder: Path) -> tuple[list[str], list[str]]:
         inside = Path(root).relative_to(folder).as_posix()
         names += files if inside == "." else [f"{inside}/{name}" for name in files]
     return names, captures
-
-
-def heic_is_read() -> bool:
-    """Tell whether Pillow reads HEIC, with the optional package pillow-heif."""
-    try:
-        import pillow_heif
-    except ImportError:
-        return False
-    pillow_heif.register_heif_opener()
-    return True
 
 
 def write_png(source: Path, target: Path) -> None:

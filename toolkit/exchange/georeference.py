@@ -124,7 +124,7 @@ def _place_by_poses(
         return Placing(None, record, [f"{PRIOR}: of no use for the scale ({facts}; {found.reason})"])
     by = found.world_from_model
     model.transform(pycolmap.Sim3d(by.scale, pycolmap.Rotation3d(by.rotation), by.translation))
-    record |= {"meters": PRIOR, "residual_m": found.rmse_m, "scale deviation": found.scale_std, "up": f"by {PRIOR}"}
+    record = {"meters": PRIOR, "residual_m": found.rmse_m, "scale deviation": found.scale_std}
     note = f"meters and world: from {PRIOR}, {facts}"
     errors = np.array([images[name].projection_center() - prior[name][:3, 3] for name in every])
     return Placing("m", record, [note], found.center_noise_m / np.sqrt(3) * drift_factor(errors, found.center_noise_m))

@@ -48,6 +48,7 @@ from toolkit.capture.images import (
     default_workers,
     exif_camera,
     find_mask,
+    heic_is_read,
     is_file,
     prefetch,
     read_header,
@@ -68,7 +69,6 @@ from toolkit.exchange.drafts import (
     DraftImage,
     end_below,
     every_nth,
-    heic_is_read,
     list_images,
     start,
 )

@@ -16,21 +16,21 @@ from tqdm.auto import tqdm
 
 from toolkit.capture.images import (
     HEADER_ERRORS,
+    HEIC_HOW,
     camera_text,
     exif_camera,
     exif_key,
     find_mask,
+    heic_is_read,
     not_an_image,
     read_header,
 )  # fmt: skip
 from toolkit.errors import CaptureError, ImageError
 from toolkit.exchange.drafts import (
     CONVERTED_SUFFIXES,
-    HEIC_HOW,
     HEIC_SUFFIXES,
     IMAGE_SUFFIXES,
     VIDEO_SUFFIXES,
-    heic_is_read,
     list_images,
     write_png,
 )

@@ -483,7 +483,10 @@ def epipolar_matches(
     # One threshold is for both images, so the second one is scaled to the size of the first.
     scale = max(size_a) / max(size_b)
     threshold_px = MAX_ERROR_SHARE * max(size_a)
-    _, mask = cv2.findFundamentalMat(pixels_a, scale * pixels_b, _prosac(threshold_px, seed))
+    try:
+        _, mask = cv2.findFundamentalMat(pixels_a, scale * pixels_b, _prosac(threshold_px, seed))
+    except cv2.error:  # OpenCV's assertion where all models are degenerate: few matches, most of them on a small strip
+        mask = None
     agree = np.zeros(0, np.int64) if mask is None else np.flatnonzero(np.ravel(mask))
     distinct = min(len(np.unique(pixels[agree], axis=0)) for pixels in (pixels_a, pixels_b))
     chance = max(2 * np.sqrt(2) * MAX_ERROR_SHARE * max(size) * np.hypot(*size) / (size[0] * size[1])

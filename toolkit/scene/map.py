@@ -18,7 +18,7 @@ from tqdm.auto import tqdm
 
 from toolkit import geometry
 from toolkit.capture import Capture, Session, masks
-from toolkit.capture.images import thumbnails
+from toolkit.capture.images import CROPPED, thumbnails
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import COMMAND, ArtifactError, CameraError, ImageError, ManifestError, reason_of
 from toolkit.features.features import KINDS
@@ -100,6 +100,8 @@ MAP_CAMERAS = 1000  # cameras of the map among which that of an image of equal s
 FOCAL_STEPS, FOCAL_DOUBT = 3, 1.3
 """Steps of the estimate of an unknown focal length; the matches must contradict one that is larger or smaller by a
 factor."""
+CENTER_DOUBT = 0.1
+"""Shift of the principal point of a cropped image, in focal lengths, that the matches must contradict, too: 6 deg."""
 FIXED_BY_MAP = ("unit", "world_up")
 """Settings that the length of the map and the turns of its images depend on, so they cannot change for a query."""
 ODD_DEPTHS_M = (0.1, 200.0)
@@ -847,9 +849,12 @@ class _UnknownFocal:
         known = [scene_map.session.camera(str(name)) for name in ids]
         self.camera, self.origin = guessed_camera(image, known)
 
-    def locate(self, focal_px: float) -> QueryResult:
-        query = self.scene_map.query(self.image, with_focal(self.camera, focal_px), None, self.turns)
-        return self.scene_map.locate(query, self.near)
+    def locate(self, focal_px: float, right: float = 0.0, down: float = 0.0) -> QueryResult:
+        """Localize with a focal length, and the principal point moved by shares of it."""
+        camera = with_focal(self.camera, focal_px)
+        camera.principal_point_x += right * focal_px
+        camera.principal_point_y += down * focal_px
+        return self.scene_map.locate(self.scene_map.query(self.image, camera, None, self.turns), self.near)
 
     def estimate(self) -> tuple[QueryResult, float | None]:
         """Localize again with the focal length that fits the matches, until none fits better.
@@ -866,10 +871,12 @@ class _UnknownFocal:
             focal_px, told = float(fitting), True
             result = self.locate(focal_px)
         text = f"focal length {focal_px:.0f} px, {'which fits its matches' if told else self.origin}"
-        others = (focal_px * FOCAL_DOUBT, focal_px / FOCAL_DOUBT)
-        if result.status == Status.OK and not told and not all(self.locate(other).misfit for other in others):
+        others: list[tuple[float, ...]] = [(focal_px * FOCAL_DOUBT, 0.0, 0.0), (focal_px / FOCAL_DOUBT, 0.0, 0.0)]
+        if CROPPED in self.origin:  # so its principal point may be anywhere
+            others += [(focal_px, *(sign * CENTER_DOUBT)) for sign in (*np.eye(2), *-np.eye(2))]
+        if result.status == Status.OK and not all(self.locate(*other).misfit for other in others):
             result = replace(result, status=Status.LOW_CONFIDENCE, reason=CAMERA)
-            text += ", and the matches do not tell it"
+            text += ", as other intrinsics do" if told else ", and the matches do not tell it"
         return replace(result, remark="; ".join(filter(None, [text, result.remark]))), focal_px if told else None
 
 
