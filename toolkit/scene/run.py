@@ -472,10 +472,9 @@ class Run:
         queries = self.queries
         if not len(queries):
             place = self.map(map_device, scene)
-            takes = list(zip(place.session.images["timestamp"], place.session.device_ids, strict=True))
-            middle = takes[len(takes) // 2]
-            rows = np.array([row for row, take in enumerate(takes) if take == middle])
-            return place.query_of_session(place.session, rows)
+            session = place.session
+            middle = session.images[["timestamp"]].assign(device_id=session.device_ids).iloc[[len(session) // 2]]
+            return place.query_of_session(session, session.rows_of_keyframes(middle)[0])
         of_map = queries[(queries["map_device"] == map_device) & (queries["scene"] == self._scene(scene))]
         status = statuses(of_map["status"])
         of_map = of_map.assign(sure=status == str(Status.OK))[status != str(Status.FAILED)]
