@@ -440,7 +440,7 @@ def _read_table(path: Path) -> pd.DataFrame:
         raise CaptureError(f"{path}: not a CSV table. Import it by {COMMAND} import transforms.")
     text = read_text(path)
     if text.startswith("# kapture format"):
-        raise _of_tool(path, "kapture, `kapture_export_colmap.py`")
+        raise _of_tool(path, "kapture", "kapture_export_colmap.py")
     first = next((line for line in text.splitlines() if line.strip()), "").split()
     of_hloc = len(first) > 4 and first[1] in pycolmap.CameraModelId.__members__
     rows = _read_hloc_list(text) if of_hloc else read_csv(path)
@@ -577,16 +577,15 @@ def import_transforms(
 
 
 _OTHER_TOOLS = {
-    "shots": "OpenSfM, `opensfm export_colmap`",
-    "sfm_data_version": "OpenMVG, `openMVG_main_openMVG2Colmap`",
+    "shots": ("OpenSfM", "opensfm export_colmap"),
+    "sfm_data_version": ("OpenMVG", "openMVG_main_openMVG2Colmap"),
 }
 """Tools that write a JSON file with a key, and their commands that export a COLMAP model."""
 
 
-def _of_tool(path: Path, tool: str) -> CaptureError:
-    """Return the error of a file of another tool, given with its command that exports a COLMAP model."""
-    name, command = tool.split(", ")
-    do = f"Export a COLMAP model by {command}, and import that by `{COMMAND} import colmap`."
+def _of_tool(path: Path, name: str, command: str) -> CaptureError:
+    """Return the error of a file of another tool, which exports a COLMAP model by a command."""
+    do = f"Export a COLMAP model by `{command}`, and import that by `{COMMAND} import colmap`."
     return CaptureError.at(path, f"a file of {name}", "a table, or a transforms.json", do)
 
 
@@ -599,7 +598,7 @@ def _read_transforms(path: Path) -> dict[str, Any]:
     for entry in content[:1] if isinstance(content, list) else [content]:
         for key, tool in _OTHER_TOOLS.items():
             if isinstance(entry, dict) and key in entry:
-                raise _of_tool(path, tool)
+                raise _of_tool(path, *tool)
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not any(isinstance(frame, dict) for frame in frames):
         found = f"keys {', '.join(map(repr, content))[:100]}" if isinstance(content, dict) else repr(content)[:100]
