@@ -18,7 +18,7 @@ from tqdm.auto import tqdm
 
 from toolkit import geometry
 from toolkit.capture import Capture, Session, masks
-from toolkit.capture.images import CROPPED, thumbnails
+from toolkit.capture.images import thumbnails
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import COMMAND, ArtifactError, CameraError, ImageError, ManifestError, reason_of
 from toolkit.features.features import KINDS
@@ -847,7 +847,7 @@ class _UnknownFocal:
         sensors = scene_map.session.sensors
         ids = sensors.loc[sensors["sensor_type"] == "camera", "sensor_id"].head(MAP_CAMERAS)
         known = [scene_map.session.camera(str(name)) for name in ids]
-        self.camera, self.origin = guessed_camera(image, known)
+        self.camera, self.origin, self.cropped = guessed_camera(image, known)
 
     def locate(self, focal_px: float, right: float = 0.0, down: float = 0.0) -> QueryResult:
         """Localize with a focal length, and the principal point moved by shares of it."""
@@ -872,7 +872,7 @@ class _UnknownFocal:
             result = self.locate(focal_px)
         text = f"focal length {focal_px:.0f} px, {'which fits its matches' if told else self.origin}"
         others: list[tuple[float, ...]] = [(focal_px * FOCAL_DOUBT, 0.0, 0.0), (focal_px / FOCAL_DOUBT, 0.0, 0.0)]
-        if CROPPED in self.origin:  # so its principal point may be anywhere
+        if self.cropped:
             others += [(focal_px, *(sign * CENTER_DOUBT)) for sign in (*np.eye(2), *-np.eye(2))]
         if result.status == Status.OK and not all(self.locate(*other).misfit for other in others):
             result = replace(result, status=Status.LOW_CONFIDENCE, reason=CAMERA)
