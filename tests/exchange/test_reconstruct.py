@@ -244,7 +244,9 @@ def test_nothing_fits(tmp_path: Path) -> None:
     assert not (tmp_path / "PLACE/sessions").exists()
 
 
-def test_a_focal_length_in_exif_that_no_model_fits_is_estimated(photographs: Path, tmp_path: Path) -> None:
+def test_a_focal_length_in_exif_that_no_model_fits_is_estimated(
+    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It was kept as the start, and "no two of 3 photographs fit together" did not name it."""
     exif = PIL.Image.Exif()
     exif[0x0110], exif.get_ifd(0x8769)[0xA405] = "Camera 5", 400
@@ -255,6 +257,9 @@ def test_a_focal_length_in_exif_that_no_model_fits_is_estimated(photographs: Pat
     text = made.report.text()
     assert "started at 1.2 times the longer side, as the focal length in EXIF fits no model" in text
     assert "the focal length in EXIF of 3 photographs is not used" in text
+    monkeypatch.setattr(module._Work, "_models", lambda *_: [])
+    with pytest.raises(CaptureError, match=r"no two of 3 .* in the model, also without its focal length in EXIF"):
+        reconstruct([tmp_path], tmp_path / "PLACE", device="other")
 
 
 def test_a_focal_length_in_exif_is_tried_again_with_learned_features(

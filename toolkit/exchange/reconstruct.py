@@ -523,10 +523,8 @@ def reconstruct(
     images = {image.name: image for image in model.images.values() if image.has_pose}
     for name, item, number in zip(work.names, work.photographs, work.camera_of, strict=True):
         if name in images:
-            in_exif = number in work.exif_px
-            origin = f"estimated, started at {'EXIF' if in_exif else START}"
-            if in_exif and not work.exif_used:
-                origin = f"estimated, started at {START}, as the focal length in EXIF fits no model"
+            dropped = ", as the focal length in EXIF fits no model" if number in work.exif_px else ""
+            origin = f"estimated, started at {'EXIF' if work.exif_used and dropped else START + dropped}"
             if number in work.known:
                 origin = f"given by {'--table' if item.name in tabled else '--camera'}"
             add_posed(draft, item, images[name], sensors[images[name].camera_id], origin)
@@ -654,7 +652,8 @@ def _reasons(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> dict[str
             reason = f"not connected: matches {count} photographs, as {other}, none in the model"
         else:
             reason = f"no pose: its {shared[image][inside].max()} matches with the model's photographs agree with none"
-        reasons[item.name] = reason
+        dropped = not work.exif_used and work.camera_of[image] in work.exif_px and shared[image].any()
+        reasons[item.name] = f"{reason}, also without its focal length in EXIF" if dropped else reason
     return reasons
 
 
