@@ -730,6 +730,18 @@ def test_a_picture_without_a_camera_gets_the_focal_length_that_fits(opened: Map,
     assert np.median(found) == pytest.approx(1, abs=0.05)
 
 
+def test_a_picture_without_a_camera_is_described_once(
+    opened: Map, small_capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its features were extracted again for each focal length that was tried."""
+    session = Capture.open(small_capture)["ios_query"]
+    pixels, extract, calls = read_image(session.image_path(0))[20:, 20:], SiftExtractor.extract, list[int]()
+    monkeypatch.setattr(SiftExtractor, "extract", lambda *given: calls.append(1) or extract(*given))
+    answer = localize_image(opened, np.ascontiguousarray(pixels))
+    assert answer.world_from_rig is not None
+    assert len(calls) == 1
+
+
 def test_a_picture_without_a_camera_that_tells_nothing(opened: Map) -> None:
     answer = localize_image(opened, np.full((300, 400), 90, np.uint8))
     assert answer.status == Status.FAILED

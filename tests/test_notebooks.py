@@ -19,7 +19,7 @@ import pytest
 
 from toolkit import notebook, pipeline
 from toolkit.errors import ArtifactError, ManifestError, StageError
-from toolkit.manifest import OPTIONAL, STAGES, Manifest, RetrieveSettings
+from toolkit.manifest import OPTIONAL, STAGES, Manifest, RerankSettings, RetrieveSettings
 from toolkit.notebook import StatusLine, notebook_parameters, notebook_path
 from toolkit.runs.folder import LOG_VARIABLE
 
@@ -152,6 +152,20 @@ def test_all_notebooks_by_hand_leave_a_finished_run_as_it_is(
         assert (own / name).read_bytes() != (run / "SMALL" / name).read_bytes(), "it did as it was told, elsewhere"
 
 
+@pytest.mark.slow
+def test_the_notebook_localizes_by_hand_as_the_run_did(small_capture: Path, tmp_path: Path) -> None:
+    """Its own `method = "pnp"`, keyframes and references of notebook 03 stood above the run's manifest."""
+    manifest = tmp_path / "near.yaml"
+    manifest.write_text(f"captures: ['{small_capture}']\noutput_root: .\nqueries: all\npairs: [[ios, hl]]\n"
+                        "rerank: {topn: 6, topk: 3}\nlocalize: {method: nearest}\n")  # fmt: skip
+    pipeline.run(manifest, "embed,retrieve,rerank,localize", say=lambda *a, **k: None)
+    chosen = {"run": str(tmp_path / "near"), "pairs": [["ios", "hl"]]}
+    notebook.execute(notebook_path("localize"), tmp_path / "04.ipynb", chosen)
+    poses = "SMALL/poses/SMALL_map_ios_query_hl.txt"
+    assert (tmp_path / "near-by-hand" / poses).read_bytes() == (tmp_path / "near" / poses).read_bytes()
+    assert "'method': 'nearest'" in (tmp_path / "04.ipynb").read_text()
+
+
 @pytest.mark.parametrize("stage", STAGES)
 def test_every_parameter_has_a_comment(stage: str) -> None:
     lines = nbformat.read(notebook_path(stage), as_version=4).cells[1].source.splitlines()
@@ -167,6 +181,7 @@ def test_every_parameter_has_an_effect(stage: str) -> None:
     code = "\n".join(cell.source for cell in cells[2:] if cell.cell_type == "code")
     used = {node.id for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Name)}
     of_stage = {"settings", *type(Manifest.defaults(stage)).model_fields} if stage in STAGES else set[str]()
+    used |= {"queries"} if "folders.queries" in code else set()
     assert notebook_parameters(notebook_path(stage)).keys() <= used | of_stage
 
 
@@ -197,21 +212,27 @@ def test_tables_of_a_run_link_to_files_that_exist(small_run: Path) -> None:
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_parameters_are_of_the_run_or_settings_with_their_defaults(stage: str) -> None:
-    section = Manifest(name="x", captures=["x"]).stage(stage)
+def test_parameters_are_of_the_run_or_settings_that_are_as_in_the_run(stage: str) -> None:
     parameters = notebook_parameters(notebook_path(stage))
     assert parameters.pop("settings") == {}, "the door to all other settings"
     chosen = {name: value for name, value in parameters.items() if name not in OF_THE_RUN}
-    assert type(section).of(chosen) == type(section)(), "a cell's defaults are those of the tree"
+    assert chosen.keys() <= type(Manifest.defaults(stage)).model_fields.keys()
+    assert {*chosen.values(), parameters.get("queries")} == {None}, "None: as in the run"
 
 
 def test_a_stage_gets_the_parameters_of_its_notebook_and_then_its_dict(monkeypatch: pytest.MonkeyPatch) -> None:
     names = {"topk": 3, "index": "a variable of the user", "settings": {"mask": {"gps": True}}}
     monkeypatch.setattr(notebook, "_user_names", lambda: names)
-    folders = notebook.Folders("retrieve")
-    assert folders.settings == RetrieveSettings.of({"topk": 3, "mask": {"gps": True}})
+    content = {"name": "x", "captures": ["x"], "queries": "all", "retrieve": {"topk": 7, "index": "HNSW32"}}
+    manifest = Manifest.of(content)
+    folders = notebook.Folders("retrieve", manifest)
+    assert folders.settings == RetrieveSettings.of({"topk": 3, "index": "HNSW32", "mask": {"gps": True}})
+    assert folders.queries == "all"
     names["settings"] = {"topk": 4}  # the cell has run again, with another value
     assert folders.settings.topk == 4
+    names |= {"topk": None, "settings": {}, "queries": "original"}
+    assert folders.settings == manifest.retrieve
+    assert folders.queries == "original"
     names["settings"] = {"topk": "many"}
     with pytest.raises(ManifestError, match=r"topk: found 'many'"):
         folders.settings  # noqa: B018
@@ -222,8 +243,9 @@ def test_a_wrong_parameter_is_named_as_in_its_cell(name: str) -> None:
     """In one line, whatever the path of its setting in the tree is, and however many types it may have."""
     parameters = notebook_parameters(notebook_path(name))
     for key, default in parameters.items():
-        may_be_none = default is None or key in ("settings", "unit_m", "features", "matcher", "predictor")
-        for wrong in ({"nonsense": 1}, [[["nonsense"]]], *([] if isinstance(default, float) else [3.5]), None):
+        may_be_none = default is None or key in ("settings", "unit_m")
+        number = isinstance(default, float) or key in ("position_drift", "rotation_drift_deg")
+        for wrong in ({"nonsense": 1}, [[["nonsense"]]], *([] if number else [3.5]), None):
             if wrong is None and may_be_none:
                 continue
             with pytest.raises(ManifestError, match=rf"^{key}: ") as caught:
@@ -251,6 +273,7 @@ def test_values_that_fit_each_other_need_not_fit_the_defaults() -> None:
     notebook.check_values("rerank", {"topn": 5, "topk": 3})
     with pytest.raises(ManifestError, match="expected topk to be at most topn"):
         notebook.check_values("rerank", {"topn": 5, "topk": 6})
+    notebook.check_values("rerank", {"topk": 50}, RerankSettings(topn=60))
 
 
 def test_a_notebook_shows_an_error_without_frames_of_the_toolkit() -> None:

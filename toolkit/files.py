@@ -495,13 +495,16 @@ class SceneFiles:
         """Folders in which every stage finds what fits its settings, whatever run has made it."""
         return self.features, self.maps, self.index
 
-    def folders(self, stage: str) -> dict[str, Path]:
-        """Return the folders through which stages exchange results, by the names of the notebooks' parameters."""
+    def folders(self, stage: str, reranked: bool = False) -> dict[str, Path]:
+        """Return the folders through which stages exchange results, by the names of the notebooks' parameters, for
+        references that are reranked or not.
+        """
         out = self.of_stage(stage)
         return {
             "map_feats_root": self.embeddings,
             "out_jsonl": self.retrieval_dir,
-            "retrieval_dir": self.retrieval_dir,
+            "retrieval_dir": self.reranked_dir if reranked and stage == "localize" else self.retrieval_dir,
+            **({"reranked_dir": self.reranked_dir} if reranked else {}),
             "features_dir": self.features,
             "map_dir": self.maps,
             "poses_dir": self.poses_dir,

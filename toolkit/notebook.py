@@ -95,11 +95,11 @@ if TEXT_BARS in os.environ:
 
 
 class Folders(SimpleNamespace):
-    """The resolved folders of a notebook, as attributes; displayed as a table. `settings` are those of its stage."""
+    """The resolved folders of a notebook, as attributes; displayed as a table, with `settings`, those of its stage."""
 
-    def __init__(self, stage: str, finished: Path | None = None, **folders: Path) -> None:
+    def __init__(self, stage: str, manifest: Manifest, finished: Path | None = None, **folders: Path | None) -> None:
         super().__init__(**folders)
-        self._stage, self._finished = stage, finished
+        self._stage, self._manifest, self._finished = stage, manifest, finished
 
     @property
     def finished_run(self) -> "Run | None":
@@ -112,13 +112,20 @@ class Folders(SimpleNamespace):
 
     @property
     def settings(self) -> Any:
-        """The settings model of the stage, from the notebook's parameters as they are now."""
-        check_values(self._stage, _user_names())
-        return stage_settings(self._stage, _user_names())
+        """The settings model of the stage: the run's, overridden by the notebook's parameters as they are now."""
+        section = self._manifest.stage(self._stage)
+        check_values(self._stage, _user_names(), section)
+        return stage_settings(self._stage, _user_names(), section)
+
+    @property
+    def queries(self) -> str:
+        """The name of a list of keyframes: the notebook's parameter as it is now or, if that is None, the run's."""
+        return _user_names().get("queries") or self._manifest.queries
 
     def __repr__(self) -> str:
-        folders = {name: path for name, path in vars(self).items() if not name.startswith("_")}
-        return "\n".join(f"{name:<{max(map(len, folders))}}  {path}" for name, path in folders.items())
+        shown: dict[str, Any] = {name: path for name, path in vars(self).items() if path and not name.startswith("_")}
+        shown["settings"] = self.settings.model_dump(mode="json", exclude_defaults=True) or "defaults"
+        return "\n".join(f"{name:<{max(map(len, shown))}}  {value}" for name, value in shown.items())
 
 
 def start(stage: str, sessions_root: str | None = None, run: str | None = None, **folders: str | None) -> Folders:
@@ -131,6 +138,7 @@ def start(stage: str, sessions_root: str | None = None, run: str | None = None, 
         **folders: the notebook's other folders by the names of its parameters; None: below `<run>-by-hand/` beside the
             run, or `runs/<scene>-by-hand/` of the repository, see `_take_from_run`. If such a default folder lacks the
             results of an earlier stage, or they are older than those of the stage before it, that stage runs now.
+            References are the reranked ones if the run has them, unless they are older than what notebook 03 made.
 
     Raises:
         ManifestError: a parameter is unknown to the notebook, or has a wrong type; or the folder for the results of a
@@ -143,23 +151,30 @@ def start(stage: str, sessions_root: str | None = None, run: str | None = None, 
         log_to(Path(run_log))
     check_given(stage)
     sessions, taken_from = sessions_of(run, sessions_root)
-    _check_devices_and_queries(stage, sessions)
     scene = sessions.parent.name
     by_hand = taken_from.with_name(f"{taken_from.name}-by-hand") if taken_from else None
     files = SceneFiles(by_hand or project_root() / "runs" / f"{scene}-by-hand", scene)
-    source = taken_from or _finished_run(files.run.parent, scene)
-    if None in folders.values():
+    source = None if run_log else taken_from or _finished_run(files.run.parent, scene)
+    manifest = _manifest_of(source, sessions)
+    check_values(stage, _user_names(), manifest.stage(stage))
+    _check_devices_and_queries(stage, sessions, manifest.queries)
+    if run_log is None and None in folders.values():
         _take_from_run(stage, files, source)
-    defaults = files.folders(stage)
-    made: set[Path | None] = {defaults[name] for name, folder in folders.items() if folder is None}
+    reranked = manifest.rerank is not None and files.reranked_dir.is_dir()
+    if reranked and (older := older_files(files.reranked_dir, "rerank")):
+        reranked = False
+        print(f"{next(iter(older.values()))} Not used: run notebook 03b for it.")
+    defaults = files.folders(stage, reranked)
+    made = {defaults.get(name) for name, folder in folders.items() if folder is None}
     _make_upstream(stage, sessions, files, made, source)
-    resolved = {"sessions_root": sessions}
+    resolved: dict[str, Path | None] = {"sessions_root": sessions}
     for name, folder in folders.items():
-        resolved[name] = Path(folder).expanduser().resolve() if folder else defaults[name]
-        written = defaults[name] == files.of_stage(stage) or name in _FILLED.get(stage, ())
-        if folder and run_log is None and written:
-            _require_outside_of_runs(name, resolved[name])
-    return Folders(stage, None if run_log else source, **resolved)
+        given = Path(folder).expanduser().resolve() if folder else None
+        resolved[name] = given or defaults.get(name)
+        written = defaults.get(name) == files.of_stage(stage) or name in _FILLED.get(stage, ())
+        if given and run_log is None and written:
+            _require_outside_of_runs(name, given)
+    return Folders(stage, manifest, source, **resolved)
 
 
 def find_run(run: str | Path) -> Path:
@@ -313,7 +328,7 @@ def choose_photograph(scene_map: Any) -> None:
             file = Path(folder) / Path(chosen["name"]).name
             file.write_bytes(chosen["content"])
             try:
-                camera = with_focal(guessed_camera(file, [])[0], focal.value) if focal.value > 0 else None
+                camera = with_focal(guessed_camera(file, []).camera, focal.value) if focal.value > 0 else None
                 result = localize_image(scene_map, file, camera)
                 display(result, result.show(), result.show_3d())
             except errors.ToolkitError as error:
@@ -450,10 +465,15 @@ def _make_upstream(stage: str, sessions: Path, files: SceneFiles, folders: set[P
         _run_stage(name, sessions, files, run)
 
 
+def _manifest_of(run: Path | None, sessions: Path) -> Manifest:
+    """Return the manifest of a finished run, or the default one for a capture."""
+    content = read_json(run / RECORD).get("manifest") if run else None
+    return Manifest.of(content or {"name": "by-hand", "captures": [str(sessions.parent)]})
+
+
 def _run_stage(stage: str, sessions: Path, files: SceneFiles, run: Path | None) -> None:
     """Run `embed`, `retrieve` or `localize` with the settings of the run that results are taken from, or defaults."""
-    content = read_json(run / RECORD).get("manifest", {}) if run else {}
-    manifest = Manifest.of(content or {"name": "by-hand", "captures": [str(sessions.parent)]})
+    manifest = _manifest_of(run, sessions)
     folders = {
         "embed": [files.embeddings],
         "retrieve": [files.embeddings, files.retrieval_dir],
@@ -472,14 +492,14 @@ def _user_names() -> dict[str, Any]:
 
 
 def check_given(name: str) -> None:
-    """Refuse, by a ManifestError that names them, wrong parameter values in the running notebook, and unknown
-    parameters that papermill has injected.
+    """Refuse, by a ManifestError that names them, wrong parameter values in the running notebook, but for settings of
+    a stage, and unknown parameters that papermill has injected.
     """
     values = _user_names()
     for source in values.get("In", []):
         if source.startswith("# Parameters\n"):
             check_parameters(notebook_path(name), _literals(source))
-    check_values(name, values)
+    check_values(name, {key: value for key, value in values.items() if key not in _of_stage(name)})
 
 
 _OWN = ("photographs", "map_images", "query_images")
@@ -511,12 +531,16 @@ def _check_own_images(given: Mapping[str, Any]) -> None:
         raise ManifestError("query_images: found None, expected the folder of your queries, with map_images.")
 
 
-def _check_devices_and_queries(stage: str, sessions: Path) -> None:
-    """Refuse parameters of the running notebook that name devices or query lists which the capture does not have."""
+def _check_devices_and_queries(stage: str, sessions: Path, queries: str) -> None:
+    """Refuse parameters of the running notebook that name devices or query lists, by default the list `queries`, which
+    the capture does not have.
+    """
     from toolkit.capture import Capture
 
     values, known = _user_names(), notebook_parameters(notebook_path(stage))
     asked = {name: values[name] for name in known if name in values}
+    if "queries" in asked:
+        asked["queries"] = asked["queries"] or queries
     if not asked:
         return
     name = "sessions_root"
@@ -538,15 +562,21 @@ def _check_devices_and_queries(stage: str, sessions: Path) -> None:
         raise CaptureError(f"{name}: {error}") from None
 
 
-def stage_settings(stage: str, values: Mapping[str, Any]) -> Settings:
-    """Return the settings of a stage from the parameters of its notebook, overridden by its dict `settings`; raise
-    ManifestError that names a wrong one.
+def stage_settings(stage: str, values: Mapping[str, Any], of_run: Settings | None = None) -> Settings:
+    """Return the settings of a stage: those of a run, or the defaults, overridden by the parameters of its notebook
+    that are not None, and these by its dict `settings`; raise ManifestError that names a wrong one.
     """
     section = type(Manifest.defaults(stage))
-    known = notebook_parameters(notebook_path(stage)).keys() & values.keys()
-    settings = section.of({key: values[key] for key in section.model_fields if key in known}, values.get("settings"))
+    known = notebook_parameters(notebook_path(stage)).keys() & section.model_fields.keys()
+    given = {key: value for key, value in values.items() if key in known and value is not None}
+    settings = section.of(of_run, given, values.get("settings"))
     check_names(settings)
     return settings
+
+
+def _of_stage(name: str) -> set[str]:
+    """Return the names of parameters that are settings, for the notebook of a stage."""
+    return {"settings", *type(Manifest.defaults(name)).model_fields} if name in STAGES else set()
 
 
 def check_names(settings: Settings) -> None:
@@ -564,22 +594,21 @@ def check_names(settings: Settings) -> None:
         matchers_of(kinds or ["sift", "aliked"], settings.matcher.name)
 
 
-def check_values(name: str, values: Mapping[str, Any]) -> None:
+def check_values(name: str, values: Mapping[str, Any], of_run: Settings | None = None) -> None:
     """Refuse, by a ManifestError that names the first one, parameters of the notebook `<number>_<name>.ipynb`, which
-    include a stage's settings, of a wrong type or value; names that are no parameters of it are ignored.
+    include a stage's settings, see `stage_settings`, of a wrong type or value; other names are ignored.
     """
     path, given = notebook_path(name), dict[str, Any]()
     defaults, meanings = notebook_parameters(path), dict(re.findall(r"^(\w+) = .*  # (.+)", _listing(path), re.M))
-    of_stage = {"settings", *type(Manifest.defaults(name)).model_fields} if name in STAGES else set()
-    if of_stage:
+    if of_stage := _of_stage(name):
         with suppress(ManifestError):  # together, as one that fits the others need not fit their defaults
-            stage_settings(name, values)
+            stage_settings(name, values, of_run)
             values = {key: value for key, value in values.items() if key not in of_stage}
     for key in [key for key in defaults if key in values]:
         given[key] = values[key]
         try:
             if key in of_stage:  # with those before it, because a matcher must fit the features
-                stage_settings(name, given)
+                stage_settings(name, given, of_run)
                 continue
             type_of_key, meaning = _TYPES.get(key, _type_of(defaults[key])), f"{meanings.get(key)}."
             fields: dict[str, Any] = {key: (type_of_key, Field(description=meaning))}

@@ -538,15 +538,12 @@ def _captures(manifest: Manifest) -> list[Path]:
 def _job(manifest: Manifest, stage: str, capture: Path, files: SceneFiles, force: bool) -> Job:
     """Return the job of a stage: the folders and pairs that its notebook has parameters for, and all its settings."""
     values: dict[str, Any] = {
-        **{name: str(folder) for name, folder in files.folders(stage).items()},
+        **{name: str(folder) for name, folder in files.folders(stage, manifest.rerank is not None).items()},
         "run": str(files.run),
         "sessions_root": str(capture / "sessions"),
         "queries": manifest.queries,
         **_selection(manifest, capture),
     }
-    if manifest.rerank is not None:
-        reranked = {"localize": "retrieval_dir", "evaluate": "reranked_dir"}
-        values |= {name: str(files.reranked_dir) for of, name in reranked.items() if of == stage}
     if force:
         values["skip_existing"] = False
     settings = manifest.stage(stage)

@@ -1,3 +1,4 @@
+import json
 import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -141,7 +142,7 @@ def test_a_drone_that_looks_straight_down_does_not_tell_where_up_is(write: Write
     assert "straight down, if z is up" in up.reason
     session = write("ios_map", _frames("r/cam", 0, pitch=-88, headings=headings, noise=2))
     for made, known in (("by the cameras", False), ("by GPS in EXIF", True)):
-        write_text(session.path / IMPORT_RECORD, f'{{"up": "z, {made}"}}')
+        write_text(session.path / IMPORT_RECORD, json.dumps({"up": f"z, {made}", "z is up": known}))
         assert estimate_world_up([session]).known == known
         assert made in estimate_world_up([session]).reason or not known
     poses = np.array([pose for _, pose in _frames("r/cam", 0, pitch=-88, headings=headings, noise=2)])

@@ -554,7 +554,8 @@ def test_cameras_come_from_a_file_or_the_table(folder: Path, tmp_path: Path) -> 
     ],
 )
 def test_a_focal_length_is_guessed_from_exif(tmp_path: Path, tags: dict[int, object], focal: float, how: str) -> None:
-    camera, said = exif_camera(save(tmp_path / "x.jpg", tags=tags))
+    camera, said, cropped = exif_camera(save(tmp_path / "x.jpg", tags=tags))
+    assert not cropped
     assert camera.params.tolist() == pytest.approx([focal, 32, 24], rel=1e-12)
     assert said.startswith("a guess from EXIF (")
     assert how in said
@@ -616,9 +617,9 @@ def test_a_crop_keeps_the_focal_length_of_the_whole_image(tmp_path: Path) -> Non
     whole = 28 * np.hypot(128, 96) / np.hypot(36, 24)
     sizes = {"crop": ((64, 30), whole), "turned": ((96, 128), whole), "small": ((64, 48), whole / 2)}
     for name, (size, expected) in sizes.items():
-        camera, said = exif_camera(save(tmp_path / f"{name}.jpg", size, tags))
+        camera, said, cropped = exif_camera(save(tmp_path / f"{name}.jpg", size, tags))
         assert camera.params[0] == pytest.approx(expected)
-        assert ("cropped" in said) == (name == "crop")
+        assert ("cropped" in said) == cropped == (name == "crop")
 
 
 @pytest.mark.parametrize("orientation", [0, 9, 65535])

@@ -244,7 +244,9 @@ def test_nothing_fits(tmp_path: Path) -> None:
     assert not (tmp_path / "PLACE/sessions").exists()
 
 
-def test_a_focal_length_in_exif_that_no_model_fits_is_estimated(photographs: Path, tmp_path: Path) -> None:
+def test_a_focal_length_in_exif_that_no_model_fits_is_estimated(
+    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It was kept as the start, and "no two of 3 photographs fit together" did not name it."""
     exif = PIL.Image.Exif()
     exif[0x0110], exif.get_ifd(0x8769)[0xA405] = "Camera 5", 400
@@ -252,7 +254,37 @@ def test_a_focal_length_in_exif_that_no_model_fits_is_estimated(photographs: Pat
         PIL.Image.open(path).save(tmp_path / f"{path.stem}.png", exif=exif)
     made = reconstruct([tmp_path], tmp_path / "PLACE")
     assert made.report.images["status"].eq("imported").all()
-    assert "started at 1.2 times the longer side" in made.report.text()
+    text = made.report.text()
+    assert "started at 1.2 times the longer side, as the focal length in EXIF fits no model" in text
+    assert "the focal length in EXIF of 3 photographs is not used" in text
+    monkeypatch.setattr(module._Work, "_models", lambda *_: [])
+    with pytest.raises(CaptureError, match=r"no two of 3 .* in the model, also without its focal length in EXIF"):
+        reconstruct([tmp_path], tmp_path / "PLACE", device="other")
+
+
+def test_a_focal_length_in_exif_is_tried_again_with_learned_features(
+    photographs: Path, small_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Forgotten because SIFT found no model, it stayed so for the model with ALIKED."""
+    exif, session = PIL.Image.Exif(), Capture.open(small_capture)["ios_map"]
+    camera = session.camera(session.images["sensor_id"].iloc[0])
+    film_mm = camera.mean_focal_length() * np.hypot(36, 24) / np.hypot(camera.width, camera.height)
+    exif[0x0110], exif.get_ifd(0x8769)[0xA405] = "Camera 5", round(film_mm)
+    for path in sorted(photographs.glob("0*"))[:3]:
+        PIL.Image.open(path).save(tmp_path / f"{path.stem}.png", exif=exif)
+    match = module._Work.match
+
+    def only_learned(work: module._Work, _: object) -> list[str]:
+        work.extract(work.kinds[0][0], range(len(work)))
+        match(work, 1, work.choose_pairs())
+        return []
+
+    monkeypatch.setattr(module._Work, "match", lambda *_: None)
+    monkeypatch.setattr(module, "_escalate", only_learned)
+    made = reconstruct([tmp_path], tmp_path / "PLACE")
+    assert made.report.images["status"].eq("imported").all()
+    assert "started at EXIF" in made.report.text()
+    assert "is not used" not in made.report.text()
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from toolkit.__main__ import app
 from toolkit.capture import Capture, Session
 from toolkit.capture.check import check_capture
+from toolkit.capture.upright import estimate_world_up
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.drafts import list_images
 from toolkit.exchange.interchange import import_images, import_transforms
@@ -393,4 +394,7 @@ def test_the_world_is_moved_to_known_places(tmp_path: Path) -> None:
     np.testing.assert_allclose(found[:, :3, 3], true, rtol=0, atol=1e-6)
     expected = [turn @ (np.array(matrix(k)) @ np.diag([1, -1, -1, 1]))[:3, :3] for k in range(count)]
     np.testing.assert_allclose(found[:, :3, :3], expected, rtol=0, atol=1e-6)
-    assert json.loads((session.path / "proc" / "import.json").read_text())["unit"] == "m"
+    record = json.loads((session.path / "proc" / "import.json").read_text())
+    assert (record["unit"], record["z is up"]) == ("m", True)
+    up = estimate_world_up([session])
+    assert (up.direction.tolist(), up.known, up.reason) == ([0, 0, 1], True, record["up"])

@@ -61,6 +61,10 @@ def test_a_camera_that_does_not_fit_most_of_its_queries_is_named_once():
     assert message.startswith("camera phone/cam: the principal point that fits is 305, 255 px (median of 2 poses)")
     assert "says 320, 240. Correct it" in message
     assert camera_messages(session, [second.drop(columns="focal_px")]) == []  # type: ignore[arg-type]
+    # One image tells only if its pose is sure but for the camera, also if it is unsure in two maps.
+    for sure, said in ((0.978, 0), (1.0, 1)):
+        alone = pd.DataFrame({"status": [doubted], "focal_px": ["4292.0"], "p_correct": [sure]})
+        assert len(camera_messages(session, [alone, alone])) == said  # type: ignore[arg-type]
     contradicted = "low_confidence: the poses of the map contradict its images"
     # A doubt for another reason, such as the map's poses, names no focal length, be the column of numbers or texts.
     for focals_px in ([np.nan] * 4, [np.nan, "450.0", "", "361.0;"], [np.nan, 450.0, 450.0, np.nan]):

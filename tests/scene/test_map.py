@@ -16,7 +16,18 @@ from numpy.typing import NDArray
 from tests.pose.test_local_triangulation import Scene
 from toolkit.features.features import LocalFeatures
 from toolkit.manifest import LocalizeSettings
-from toolkit.pose.base import CAMERA, Localizer, Prior, Query, QueryMatches, QueryResult, References, Rival, Status
+from toolkit.pose.base import (
+    CAMERA,
+    Localizer,
+    Prior,
+    Query,
+    QueryMatches,
+    QueryResult,
+    References,
+    Rival,
+    Status,
+    View,
+)
 from toolkit.scene.map import Map, localize_images
 
 
@@ -172,11 +183,15 @@ class OfOneCamera:
 
     session = SimpleNamespace(sensors=pd.DataFrame({"sensor_type": [], "sensor_id": []}))
 
-    def query(self, image: Any, camera: pycolmap.Camera, *_: Any) -> tuple[float, int]:
-        return camera.mean_focal_length(), 1 if isinstance(image, Path) else int(np.asarray(image).max())
+    def query(self, image: Any, camera: pycolmap.Camera, *_: Any) -> Query:
+        return Query([View("image", image, camera, False)], np.eye(4)[None])
 
-    def locate(self, query: tuple[float, int], near: Any) -> QueryResult:
-        focal_px, tells = query
+    def describe(self, query: Query) -> Query:
+        return query
+
+    def locate(self, query: Query, near: Any) -> QueryResult:
+        (view,) = query.views
+        focal_px, tells = view.camera.mean_focal_length(), 1 if isinstance(view.image, Path) else int(view.image.max())
         true = abs(focal_px - 500) < 1 or (tells == 2 and focal_px > 300)
         result = replace(OK if true or not tells else DOUBTED, num_inliers=50)
         return result if true or not tells else replace(result, focals_px=(500.0,))

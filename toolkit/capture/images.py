@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -54,7 +54,6 @@ _MASK_DEPTH = 4  # largest number of folders and files in the path of an image b
 NO_FILE = "no such file"
 EXIF_CAMERA = (0x010F, 0x0110, _FOCAL_MM, _FOCAL_35MM)
 """EXIF tags that distinguish cameras: make, model and focal lengths."""
-CROPPED = " of the whole image, which was cropped"
 _FILM_DIAGONAL_MM = float(np.hypot(36, 24))
 CAMERA_TYPES = ("camera", "depth")  # sensor types with intrinsics; only `camera` takes photographs
 WIDE = ("FISHEYE", "FOV", "EUCM")  # ends of the names of models for fields of view of 180 degrees and more
@@ -348,7 +347,17 @@ def exif_key(exif: Mapping[int, Any]) -> tuple[str, ...]:
     return tuple(str(exif.get(tag, "")) for tag in EXIF_CAMERA)
 
 
-def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
+class GuessedCamera(NamedTuple):
+    """Intrinsics of an image that nobody gave."""
+
+    camera: pycolmap.Camera
+    origin: str
+    """Where the focal length is from, in words."""
+    cropped: bool = False
+    """The image is a part of the one that EXIF describes, so its principal point may be anywhere."""
+
+
+def exif_camera(path: Path) -> GuessedCamera:
     """Guess the intrinsics of an image from its EXIF tags: no distortion, principal point in the image center.
 
     FocalLengthIn35mmFilm refers to the diagonal of 36 mm x 24 mm film (CIPA DC-008). Without that tag, the focal length
@@ -377,10 +386,10 @@ def exif_camera(path: Path) -> tuple[pycolmap.Camera, str]:
         such_as = f"'SIMPLE_PINHOLE,{width},{height},FOCAL_PX,{width / 2:g},{height / 2:g}'"
         options = f"--camera 'MODEL,W,H,...', such as {such_as}, with --cameras, or in the table"
         raise ImageError(f"no focal length in EXIF: give the intrinsics with {options}")
-    how += CROPPED if cropped else ""
+    how += " of the whole image, which was cropped" if cropped else ""
     params = [float(focal_px), width / 2, height / 2]
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
-    return camera, f"a guess from EXIF ({how}), without distortion"
+    return GuessedCamera(camera, f"a guess from EXIF ({how}), without distortion", cropped)
 
 
 # Cameras

@@ -71,9 +71,9 @@ def estimate_world_up(sessions: Sequence[Session]) -> WorldUp:
         names = ", ".join(session.id for session in sessions) or "none"
         fault = f"No image of the map sessions ({names}) has a pose, so the up direction cannot be estimated"
         raise CaptureError(f"{fault}: expected poses in trajectories.txt. Or set `world_up` in the manifest.")
-    for made in (str(read_json(session.path / IMPORT_RECORD).get("up")) for session in sessions):
-        if made.startswith("z, by ") and made != "z, by the cameras":
-            return WorldUp(np.array([0.0, 0.0, 1.0]), True, f"(0, 0, 1), {made.removeprefix('z, ')}")
+    for record in (read_json(session.path / IMPORT_RECORD) for session in sessions):
+        if record.get("z is up"):
+            return WorldUp(np.array([0.0, 0.0, 1.0]), True, record["up"])
     if _look_down_z(axes):
         reason = f"(0, 0, 1), a guess from {count} images that all look along -z: straight down, if z is up"
         return WorldUp(np.array([0.0, 0.0, 1.0]), False, reason)

@@ -519,7 +519,8 @@ class Draft(Options):
                     listed = pd.concat([pd.read_csv(list_file, dtype=str, keep_default_na=False), table])
                     listed = listed.drop_duplicates("image", keep="last")
                 old = read_json(session / IMPORT_RECORD)
-                record = old | record | {"before": self.before, "up": old.get("up", record["up"])}
+                world = {key: (old or record).get(key) for key in ("up", "z is up")}
+                record = old | record | {"before": self.before} | world
             with write_atomic(list_file) as temporary:
                 listed.to_csv(temporary, index=False)
             if self.placing == "link" or (self.before and is_linked_here(self.session)):

@@ -101,6 +101,7 @@ def place(
     model.transform(new_from_old)
     by = how if level else "the cameras"
     record |= {"meters": how, "residual_m": residual_m, "scale deviation": scale_deviation, "up": f"by {by}"}
+    record["z is up"] = level
     if origin is not None:
         record["origin"] = dict(zip(GEO_COLUMNS[:3], origin.tolist(), strict=True))
         record["axes"] = "x east, y north, z up"

@@ -366,7 +366,7 @@ def _camera_of(
         raise CaptureError(f"cameras.txt has {len(by_id)} cameras; give a table with the columns image, camera_id.")
     if by_id:
         return next(iter(by_id.values())), "given by cameras.txt"
-    return (shared, "given by --camera") if shared is not None else exif_camera(path)
+    return (shared, "given by --camera") if shared is not None else exif_camera(path)[:2]
 
 
 def _has_cameras(table: str | Path | None, cameras: str | Path | None) -> bool:

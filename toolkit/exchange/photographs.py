@@ -235,7 +235,7 @@ def initial_cameras(
 def _initial(path: Path, size: tuple[int, int]) -> pycolmap.Camera:
     width, height = size
     try:
-        focal_px, known = exif_camera(path)[0].mean_focal_length(), True
+        focal_px, known = exif_camera(path).camera.mean_focal_length(), True
     except ImageError:
         focal_px, known = FOCAL_PRIOR * max(size), False
     params = [focal_px, width / 2, height / 2, 0.0]

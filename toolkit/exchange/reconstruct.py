@@ -76,6 +76,7 @@ NEIGHBORS, SIMILAR = 10, 20  # else each photograph with so many next ones in it
 MIN_VERIFIED = 15  # of a pair that counts
 MIN_MODEL = 3  # photographs of a model
 ESCALATED = 6  # similar ones of each photograph that SIFT leaves out, with which learned features are tried
+START = f"{FOCAL_PRIOR} times the longer side"  # a focal length that nothing tells
 RATIO = 0.8  # of SIFT's matches; fewer of them are wrong than with the larger one for queries
 LOSS_PX, MAX_ERROR_PX, MIN_ANGLE_DEG = 0.5, 4.0, 1.5
 """Of the last bundle adjustment: scale of the Cauchy loss and largest error of an observation, in pixels of the image
@@ -130,6 +131,10 @@ class _Work:
         self.camera_of, self.cameras = initial_cameras(photographs, known, self.rigs)
         self.known = {number for number, item in zip(self.camera_of, photographs, strict=True) if item.name in known}
         """Numbers of the cameras whose intrinsics stay as they are."""
+        self.exif_px = {number: camera.params[0] for number, camera in enumerate(self.cameras)
+                        if camera.has_prior_focal_length and number not in self.known}  # fmt: skip
+        """Focal lengths from EXIF, by number of the camera; all are used, or none if no model fits them."""
+        self.exif_used = True
         session = folder / "sessions" / f"{device}_map"
         shutil.rmtree(session, ignore_errors=True)
         draft = Draft(session, folder, sources={item.name: item.path for item in photographs})
@@ -230,15 +235,6 @@ class _Work:
         with _quiet():
             pycolmap.create_pose_prior_bundle_adjuster(options, found, config, priors, model).solve()
 
-    def forget_focal_lengths(self) -> bool:
-        """Start focal lengths from EXIF as if EXIF had none, and tell whether there are any: no model may fit them."""
-        guessed = [camera for number, camera in enumerate(self.cameras)
-                   if camera.has_prior_focal_length and number not in self.known]  # fmt: skip
-        for camera in guessed:
-            camera.params = [FOCAL_PRIOR * max(camera.width, camera.height), *camera.params[1:]]
-            camera.has_prior_focal_length = False
-        return bool(guessed)
-
     def match(self, kind: int, pairs: Sequence[tuple[int, int]]) -> None:
         """Match pairs and keep the matches that agree with one relative pose of their cameras."""
         method, store = self.kinds[kind]
@@ -322,7 +318,25 @@ class _Work:
                 database.write_two_view_geometry(*ids, geometry)
         return path
 
-    def map(self, mapper: str = "incremental") -> list[pycolmap.Reconstruction]:
+    def map(self, mapper: str, before: Sequence[pycolmap.Reconstruction] = ()) -> list[pycolmap.Reconstruction]:
+        """Return models whose focal lengths start as in EXIF or, if there is no such model, as if EXIF had none.
+
+        If the models `before`, of fewer features, start without EXIF, one with it must be as large as their largest.
+        """
+        least = before[0].num_reg_images() if before and not self.exif_used else 1
+        models = list[pycolmap.Reconstruction]()
+        for used in (True, False) if self.exif_px else (True,):
+            self.exif_used = used
+            for number, focal_px in self.exif_px.items():
+                camera = self.cameras[number]
+                start_px = focal_px if used else FOCAL_PRIOR * max(camera.width, camera.height)
+                camera.params, camera.has_prior_focal_length = [start_px, *camera.params[1:]], used
+            models = self._models(mapper)
+            if models and models[0].num_reg_images() >= least:
+                break
+        return models
+
+    def _models(self, mapper: str) -> list[pycolmap.Reconstruction]:
         """Return the models, the largest first; of the others, those that have a photograph that it lacks."""
         database, out = self.write_database(), self.folder / "models"
         shutil.rmtree(out, ignore_errors=True)
@@ -489,11 +503,9 @@ def reconstruct(
     matcher.strongest = STRONGEST if len(pairs) > FEW_PAIRS else None
     work.match(0, pairs)
     models = work.map(mapper)
-    if not models and work.forget_focal_lengths():
-        models = work.map(mapper)
     notes = _escalate(work, models)
     if len(work.kinds) > 1 and any(work.pairs[1]):
-        models = work.map(mapper)
+        models = work.map(mapper, models)
     if not models:
         worst = "; ".join(f"{name}: {reason}" for name, reason in list(_reasons(work, models).items())[:3])
         raise CaptureError(f"{sources[0]}: no two of {len(work)} photographs fit together. {worst}.")
@@ -511,11 +523,11 @@ def reconstruct(
     images = {image.name: image for image in model.images.values() if image.has_pose}
     for name, item, number in zip(work.names, work.photographs, work.camera_of, strict=True):
         if name in images:
-            image, known_focal = images[name], work.cameras[number].has_prior_focal_length
-            origin = f"estimated, started at {'EXIF' if known_focal else f'{FOCAL_PRIOR} times the longer side'}"
+            dropped = ", as the focal length in EXIF fits no model" if number in work.exif_px else ""
+            origin = f"estimated, started at {'EXIF' if work.exif_used and dropped else START + dropped}"
             if number in work.known:
                 origin = f"given by {'--table' if item.name in tabled else '--camera'}"
-            add_posed(draft, item, image, sensors[image.camera_id], origin)
+            add_posed(draft, item, images[name], sensors[images[name].camera_id], origin)
     draft.rows += [{"image": name, "status": reason} for name, reason in _reasons(work, models).items()]
     sizes, error_px = [each.num_reg_images() for each in models], model.compute_mean_reprojection_error()
     record = {
@@ -530,6 +542,9 @@ def reconstruct(
     if sizes[1:]:
         where = ", ".join(f"{size} in {path}" for size, path in zip(sizes[1:], paths[1:], strict=True))
         draft.notes.append(f"not connected to it, so not used: models of {where}")
+    if work.exif_px and not work.exif_used:
+        count = sum(number in work.exif_px for number in work.camera_of)
+        draft.notes.append(f"the focal length in EXIF of {count} photographs is not used, as no model fits it")
     draft.notes += placed.notes
     report = draft.finish(None if rigs else {name for name in held if name in draft.poses})
     for one in filter(None, (report, report.held_out)):
@@ -637,7 +652,8 @@ def _reasons(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> dict[str
             reason = f"not connected: matches {count} photographs, as {other}, none in the model"
         else:
             reason = f"no pose: its {shared[image][inside].max()} matches with the model's photographs agree with none"
-        reasons[item.name] = reason
+        dropped = not work.exif_used and work.camera_of[image] in work.exif_px and shared[image].any()
+        reasons[item.name] = f"{reason}, also without its focal length in EXIF" if dropped else reason
     return reasons
 
 

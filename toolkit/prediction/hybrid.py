@@ -9,7 +9,7 @@ matches are with one image, no reprojection error shows this. So the covariance 
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -77,6 +77,7 @@ class DepthLifter:
         `MappedFeatures`.
         """
         self._first, self._pnp, self._seen_depth, self._most = pnp.matcher.mapped[0], pnp, seen_depth, most
+        self._log_scale = cache(self._find_log_scale)
         self._warned = False
 
     @fixed_sums
@@ -163,13 +164,13 @@ class DepthLifter:
         )
         return LiftedMap(part, triangulated, np.concatenate([np.full(len(triangulated), -1), lifted_from]), depths)
 
-    def _log_scale(self, image: int, seen: SeenDepth) -> float:
+    def _find_log_scale(self, image: int) -> float:
         """Return the logarithm of the depth of depth maps, divided by that of the triangulated points of an image, in
         the median; NaN if it has too few of them.
         """
         local_map = self._first.map
         keypoints, points = local_map.observations(image)
-        depth_m = seen.at(self._first.features[local_map.image_names[image]].keypoints[keypoints])
+        depth_m = self._seen_depth(image).at(self._first.features[local_map.image_names[image]].keypoints[keypoints])
         ratios = depth_m / geometry.transform(local_map.cams_from_world[image], local_map.points[points])[:, 2]
         ratios = ratios[ratios > 0]
         return float(np.log(np.median(ratios))) if len(ratios) >= LEAST_RATIOS else np.nan
@@ -183,15 +184,15 @@ class DepthLifter:
         """
         seen = np.bincount(self._first.map.obs_image, minlength=len(self._first.map.image_names))
         most = np.argsort(-seen, kind="stable")[:MEASURED]
-        errors = np.array([self._log_scale(image, self._seen_depth(image)) for image in most[seen[most] > 0].tolist()])
+        errors = np.array([self._log_scale(image) for image in most[seen[most] > 0].tolist()])
         errors = errors[np.abs(errors) <= MAX_RATIO_SPREAD]
         common = DEPTH_MAP_STD**2 / 2 + errors.sum() ** 2 / max(len(errors), 1)
         variances = np.array([DEPTH_MAP_STD**2 + np.square(errors).sum(), common]) / (1 + len(errors))
         return float(np.sqrt(variances[0])), float(np.sqrt(variances[1]))
 
-    def _fits(self, image: int, seen: SeenDepth) -> bool:
+    def _fits(self, image: int) -> bool:
         """Tell whether depth maps agree with the triangulated points of an image, if it has enough of them."""
-        log_scale = self._log_scale(image, seen)
+        log_scale = self._log_scale(image)
         if not abs(log_scale) > MAX_RATIO_SPREAD:
             return True
         if not self._warned:
@@ -202,9 +203,8 @@ class DepthLifter:
 
     def _depth(self, image: int, xy: Floats, predicted: tuple[CameraAnswer, int] | None) -> Depth | None:
         """Return the depth at pixels of a map image from the capture's depth maps, else the predicted depth."""
-        seen = self._seen_depth(image)
-        depth_m = seen.at(xy)
-        if np.isfinite(depth_m).sum() >= LEAST_LIFTED and self._fits(image, seen):
+        depth_m = self._seen_depth(image).at(xy)
+        if np.isfinite(depth_m).sum() >= LEAST_LIFTED and self._fits(image):
             return Depth(depth_m, *self._scale_stds)
         if predicted is None:
             return None

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from toolkit.capture.images import in_view, view_bounds
 from toolkit.files import image_name
 from toolkit.geometry import Floats, Ints, invert, pose_error, transform
+from toolkit.manifest import PnpSettings
 from toolkit.pose.base import Status, statuses
 from toolkit.runs.folder import counted
 
@@ -184,34 +185,38 @@ def summary_of(
 def camera_messages(session: "Session", tables: Sequence[pd.DataFrame]) -> list[str]:
     """Return a message for each camera whose focal length or principal point does not fit most of its queries.
 
+    Two images must tell, or one whose probability is that of `ok` poses: wrong matches fit some focal length, too.
     Cameras whose names differ only in a timestamp at the end count as one: a phone may have one for each picture.
 
     Args:
         session: session of the queries.
-        tables: `poses/<pair>.csv` of pairs with these queries: timestamp, device_id, status, focal_px and
+        tables: `poses/<pair>.csv` of pairs with these queries: timestamp, device_id, status, p_correct, focal_px and
             principal_point_px.
     """
     posed, sensors, columns = Counter[str](), session.images["sensor_id"].to_numpy(), ("focal_px", "principal_point_px")
-    fitted: dict[tuple[str, str], list[tuple[list[float], str]]] = {}
+    fitted: dict[tuple[str, str], list[tuple[list[float], int, bool]]] = {}
     for table in tables:
+        sure = table.reindex(columns=["p_correct"])["p_correct"].to_numpy(float) >= PnpSettings().ok_probability
         rows = table.reindex(columns=["status", *columns]).astype(object)
         texts = rows.where(rows.notna(), "").astype(str).to_dict("records")
-        for images, row in zip(session.rows_of_keyframes(table), texts, strict=True):
+        for images, row, certain in zip(session.rows_of_keyframes(table), texts, sure, strict=True):
             status, reason = Status.parse(row["status"] or Status.FAILED)
             if status is Status.FAILED:
                 continue
             names = [re.sub(r"[_-]\d{6,}$", "", sensor_id) for sensor_id in sensors[images]]
             posed.update(names)
             for column in columns if status is Status.LOW_CONFIDENCE and reason else ():
-                for name, sensor_id, value in zip(names, sensors[images], row[column].split(";"), strict=False):
+                for name, image, value in zip(names, images, row[column].split(";"), strict=False):
                     if value:
-                        fitted.setdefault((name, column), []).append(([float(x) for x in value.split()], sensor_id))
+                        fit = [float(x) for x in value.split()], int(image), bool(certain)
+                        fitted.setdefault((name, column), []).append(fit)
     messages = []
     for (name, column), found in fitted.items():
-        if len(found) < posed[name] / 2:
+        values, seen_in, is_sure = zip(*found, strict=True)
+        if len(found) < posed[name] / 2 or (len({*seen_in}) < 2 and not any(is_sure)):
             continue
         file, median_of = f"{session.id}/sensors.txt", f"(median of {counted(len(found), 'poses')})"
-        fits_px, cameras = np.array([value for value, _ in found]), [session.camera(sensor) for _, sensor in found]
+        fits_px, cameras = np.array(values), [session.camera(sensors[image]) for image in seen_in]
         if column == "focal_px":
             stated = np.array([camera.mean_focal_length() for camera in cameras])
             fits = f"the focal length that fits is {np.median(fits_px):.0f} px {median_of}, "

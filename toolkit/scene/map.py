@@ -18,7 +18,7 @@ from tqdm.auto import tqdm
 
 from toolkit import geometry
 from toolkit.capture import Capture, Session, masks
-from toolkit.capture.images import CROPPED, thumbnails
+from toolkit.capture.images import sees_all, thumbnails
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import COMMAND, ArtifactError, CameraError, ImageError, ManifestError, reason_of
 from toolkit.features.features import KINDS
@@ -847,14 +847,19 @@ class _UnknownFocal:
         sensors = scene_map.session.sensors
         ids = sensors.loc[sensors["sensor_type"] == "camera", "sensor_id"].head(MAP_CAMERAS)
         known = [scene_map.session.camera(str(name)) for name in ids]
-        self.camera, self.origin = guessed_camera(image, known)
+        self.camera, self.origin, self.cropped = guessed_camera(image, known)
+        self.described: Query | None = None  # with features, while different intrinsics are tried
 
     def locate(self, focal_px: float, right: float = 0.0, down: float = 0.0) -> QueryResult:
         """Localize with a focal length, and the principal point moved by shares of it."""
         camera = with_focal(self.camera, focal_px)
         camera.principal_point_x += right * focal_px
         camera.principal_point_y += down * focal_px
-        return self.scene_map.locate(self.scene_map.query(self.image, camera, None, self.turns), self.near)
+        query = self.scene_map.query(self.image, camera, None, self.turns)
+        if sees_all(camera):  # else features depend on the focal length
+            self.described = self.described or self.scene_map.describe(query)
+            query = replace(query, features=self.described.features, descriptors=self.described.descriptors)
+        return self.scene_map.locate(query, self.near)
 
     def estimate(self) -> tuple[QueryResult, float | None]:
         """Localize again with the focal length that fits the matches, until none fits better.
@@ -862,6 +867,7 @@ class _UnknownFocal:
         Returns:
             The result, and the focal length in pixels; None if the matches do not contradict the guess.
         """
+        started = time.perf_counter()
         focal_px, told = self.camera.mean_focal_length(), False
         result = self.locate(focal_px)
         for _ in range(FOCAL_STEPS):
@@ -872,12 +878,14 @@ class _UnknownFocal:
             result = self.locate(focal_px)
         text = f"focal length {focal_px:.0f} px, {'which fits its matches' if told else self.origin}"
         others: list[tuple[float, ...]] = [(focal_px * FOCAL_DOUBT, 0.0, 0.0), (focal_px / FOCAL_DOUBT, 0.0, 0.0)]
-        if CROPPED in self.origin:  # so its principal point may be anywhere
+        if self.cropped:
             others += [(focal_px, *(sign * CENTER_DOUBT)) for sign in (*np.eye(2), *-np.eye(2))]
         if result.status == Status.OK and not all(self.locate(*other).misfit for other in others):
             result = replace(result, status=Status.LOW_CONFIDENCE, reason=CAMERA)
             text += ", as other intrinsics do" if told else ", and the matches do not tell it"
-        return replace(result, remark="; ".join(filter(None, [text, result.remark]))), focal_px if told else None
+        self.described = None
+        remark, seconds = "; ".join(filter(None, [text, result.remark])), time.perf_counter() - started
+        return replace(result, remark=remark, seconds=seconds), focal_px if told else None
 
 
 def needs_upright(settings: LocalizeSettings, kinds: Sequence[AnyMethod]) -> bool:

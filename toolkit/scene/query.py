@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from toolkit.capture import Session
 from toolkit.capture.images import (
+    GuessedCamera,
     camera_text,
     exif_camera,
     exif_key,
@@ -138,8 +139,8 @@ def pixels_from(image: Any) -> NDArray[np.uint8]:
     return np.round(pixels * scale).astype(np.uint8)
 
 
-def guessed_camera(image: Image, known: Sequence[pycolmap.Camera]) -> tuple[pycolmap.Camera, str]:
-    """Return a camera of an image, and where its focal length is from: EXIF, the only known one of its size, or none.
+def guessed_camera(image: Image, known: Sequence[pycolmap.Camera]) -> GuessedCamera:
+    """Return a camera of an image whose focal length is from EXIF, the only known one of its size, or a guess.
 
     Raises:
         ImageError: the image cannot be read.
@@ -154,10 +155,10 @@ def guessed_camera(image: Image, known: Sequence[pycolmap.Camera]) -> tuple[pyco
         height, width = pixels_from(image).shape[:2]
     alike = {camera_text(camera): camera for camera in known if (camera.width, camera.height) == (width, height)}
     if len(alike) == 1:
-        return next(iter(alike.values())), "that of the map's camera"
+        return GuessedCamera(next(iter(alike.values())), "that of the map's camera")
     params = [FOCAL_PRIOR * max(width, height), width / 2, height / 2]
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
-    return camera, f"a guess, {FOCAL_PRIOR:g} times the longer side"
+    return GuessedCamera(camera, f"a guess, {FOCAL_PRIOR:g} times the longer side")
 
 
 def camera_key(image: Image, camera: pycolmap.Camera) -> tuple[Any, ...]:
