@@ -349,25 +349,30 @@ def _run(manifest: Manifest, only: str | None, force: bool, say: Say, cluster: s
     return run_dir
 
 
-def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: bool, say: Say, kernels: Kernels) -> None:
-    captures = _captures(manifest)
-    of_manifest = [stage for stage in STAGES if stage in manifest.stages]
+def _jobs(
+    manifest: Manifest, captures: list[Path], stages: list[str], run_dir: Path, force: bool
+) -> tuple[list[Job], RunLog]:
+    """Return the jobs of the stages, and the record of the run, with earlier rows of the manifest's other stages."""
     every = [
         _job(manifest, stage, capture, SceneFiles(run_dir, capture.name), force)
-        for capture, stage in product(captures, of_manifest)
+        for capture, stage in product(captures, manifest.stages)
     ]
-    jobs = [job for job in every if job.stage in stages]
-    inputs = {capture.name: tree_fingerprint(capture / "sessions") for capture in captures}
-    for job in jobs:
-        # Weights first, because `_reusable` reads all output files of the job.
-        if _weights_needed(job.stage, job.settings) and (
-            force or not _reusable(job, _inputs_of(job, inputs[job.files.scene]))
-        ):
-            _require_weights(job.stage, job.settings)
     left = [job for job in every if job.stage not in stages]
+    inputs = {capture.name: tree_fingerprint(capture / "sessions") for capture in captures}
     record = RunLog(
         run_dir, manifest, inputs, _code_fingerprint(), lambda: [row for job in left if (row := job.earlier_row())]
     )
+    return [job for job in every if job.stage in stages], record
+
+
+def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: bool, say: Say, kernels: Kernels) -> None:
+    jobs, record = _jobs(manifest, _captures(manifest), stages, run_dir, force)
+    for job in jobs:
+        # Weights first, because `_reusable` reads all output files of the job.
+        if _weights_needed(job.stage, job.settings) and (
+            force or not _reusable(job, _inputs_of(job, record.inputs[job.files.scene]))
+        ):
+            _require_weights(job.stage, job.settings)
     failed: list[tuple[Job, StageError]] = []
     lost = set[tuple[str, str]]()
     try:
@@ -375,7 +380,7 @@ def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: boo
         for i, job in enumerate(jobs, 1):
             kernels.left = len(jobs) - i + 1
             head = f"[{i}/{len(jobs)}] {job.stage:<9} {job.files.scene}"
-            scene, job_inputs = job.files.scene, _inputs_of(job, inputs[job.files.scene])
+            scene, job_inputs = job.files.scene, _inputs_of(job, record.inputs[job.files.scene])
             if cause := next((stage for stage in UPSTREAM[job.stage] if (scene, stage) in lost), None):
                 message = f"skipped: {cause} has failed"
                 row = {"stage": job.stage, "scene": scene, "status": "skipped", "error": message}
@@ -421,14 +426,7 @@ def _build_maps(manifest: Manifest, run_dir: Path, say: Say) -> None:
     from toolkit.retrieve import index_maps
 
     captures = _captures(manifest)
-    inputs = {capture.name: tree_fingerprint(capture / "sessions") for capture in captures}
-    jobs = [
-        _job(manifest, stage, capture, SceneFiles(run_dir, capture.name), False)
-        for capture, stage in product(captures, manifest.stages)
-    ]
-    record = RunLog(
-        run_dir, manifest, inputs, _code_fingerprint(), lambda: [row for job in jobs if (row := job.earlier_row())]
-    )
+    _, record = _jobs(manifest, captures, [], run_dir, False)
     if manifest.rerank is not None:
         say("rerank: not used for photographs that are localized in a map by itself")
         manifest = manifest.model_copy(update={"rerank": None})

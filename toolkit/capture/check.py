@@ -252,14 +252,10 @@ class _SessionCheck:
             else:
                 self.sizes[sensor] = verdict
 
-    @property
-    def _has_given_times(self) -> bool:
-        made = read_json(self.session.path / IMPORT_RECORD).get("timestamps")
-        return isinstance(made, list) and "as given" in made
-
     def _check_steps(self) -> None:
         """Report times that seem to have another unit than microseconds; those that imports made are from EXIF."""
-        if (self.session.path / IMPORT_RECORD).is_file() and not self._has_given_times:
+        record = self.session.path / IMPORT_RECORD
+        if record.is_file() and "as given" not in str(read_json(record).get("timestamps")):
             return
         frames = self.session.images[["timestamp"]].assign(subsession=self.session.subsession_of())
         steps = [np.diff(np.unique(times_of(one))) for _, one in frames.groupby("subsession")]

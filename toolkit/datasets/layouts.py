@@ -110,8 +110,9 @@ def import_dataset(
 # Reading
 
 
-def _matrix(path: Path) -> Floats | str:
-    """Return a pose (4, 4) from a file of four lines, or why there is none: tracking was lost."""
+def _pose_of(image: Path) -> Floats | str:
+    """Return the pose (4, 4) in `frame-000000.pose.txt` beside an image, or why there is none: tracking was lost."""
+    path = image.with_name(f"{image.name.split('.')[0]}.pose.txt")
     try:
         rows = np.array([numbers_of(where, words, 4) for where, words in lines_of(path)])
     except CaptureError as error:
@@ -162,15 +163,10 @@ def _seven_scenes(folder: Path) -> tuple[Path, list[Photograph]]:
             if not recording.is_dir():
                 raise CaptureError(f"{recording}: no such folder. Unpack {recording.name}.zip there.")
             images += [
-                Photograph(path.relative_to(folder).as_posix(), split, camera, _matrix(_beside(path, "pose.txt")))
+                Photograph(path.relative_to(folder).as_posix(), split, camera, _pose_of(path))
                 for path in recording.glob("*.color.png")
             ]
     return folder, images
-
-
-def _beside(path: Path, suffix: str) -> Path:
-    """Return `frame-000000.<suffix>` beside `frame-000000.color.png`."""
-    return path.with_name(f"{path.name.split('.')[0]}.{suffix}")
 
 
 def _twelve_scenes(folder: Path) -> tuple[Path, list[Photograph]]:
@@ -188,7 +184,7 @@ def _twelve_scenes(folder: Path) -> tuple[Path, list[Photograph]]:
     for path in (folder / "data").glob("*.color.jpg"):
         split = "query" if int(re.sub(r"\D", "", path.name.split(".")[0]) or -1) in tested else "map"
         name = path.relative_to(folder).as_posix()
-        images.append(Photograph(name, split, camera, _matrix(_beside(path, "pose.txt"))))
+        images.append(Photograph(name, split, camera, _pose_of(path)))
     return folder, images
 
 

@@ -8,6 +8,7 @@ them only; then exact scores are computed from the vectors on disk.
 import logging
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture.masks import Masks
-from toolkit.errors import ArtifactError, ManifestError, ToolkitError, first_line
+from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.files import (
     file_fingerprint,
     fingerprint,
@@ -310,7 +311,10 @@ def make_index(
     """
     for path, record, part in _files(embeddings, map_id, vectors, settings):
         if not (skip_existing and is_current(path, record)):
-            _write(path, _build(part, settings.index))
+            index = _build(part, settings.index)
+            fault = f"{path}: the map's index cannot be written"
+            with write_atomic(path) as temporary, _faults(ToolkitError, fault, "Free some disk."):
+                faiss.write_index(index, str(temporary))
             write_sidecar(path, record)
     return load_index(embeddings, map_id, vectors, settings)
 
@@ -335,7 +339,8 @@ def _files(
     embeddings: Path, map_id: str, vectors: Vectors, settings: RetrieveSettings
 ) -> list[tuple[Path, dict[str, Any], StoredVectors]]:
     """Return file, record and vectors of the index of each descriptor; none if the search is exact for one of them."""
-    if not all(_is_needed(settings, part) for part in vectors.parts.values()):
+    sizes = map(int, re.findall(r"(?:PCA|IVF)(\d+)", settings.index))  # dimensions and cells
+    if settings.index == EXACT or len(vectors) <= max([settings.index_candidates, *sizes]):
         return []
     files = []
     for name, part in vectors.parts.items():
@@ -346,11 +351,9 @@ def _files(
 
 
 def _open(path: Path, record: dict[str, Any], vectors: StoredVectors, settings: RetrieveSettings) -> Any:
-    try:
-        require_whole(path)
+    require_whole(path)
+    with _faults(ArtifactError, f"{path}: the map's index cannot be read", "Retrieve again."):
         index = faiss.read_index(str(path))
-    except RuntimeError as error:
-        raise ArtifactError(f"{path}: the map's index cannot be read ({first_line(error)}). Retrieve again.") from error
     expected = fingerprint(record)
     stored = read_json(sidecar_path(path)).get("fingerprint", expected)
     if stored != expected or (index.ntotal, index.d) != (len(vectors.rows), vectors.dim):
@@ -358,57 +361,40 @@ def _open(path: Path, record: dict[str, Any], vectors: StoredVectors, settings: 
         raise ArtifactError(f"{path}: {made_from}. Retrieve again.")
     if not settings.faiss_gpu:
         return index
-    try:
+    fault = f"faiss_gpu: the installed FAISS cannot put the index {settings.index} on a GPU"
+    # faiss-cpu lacks classes that this function uses.
+    with _faults(ToolkitError, fault, "Set faiss_gpu: false.", (AttributeError, NameError, RuntimeError)):
         return faiss.index_cpu_to_all_gpus(index)
-    except (AttributeError, NameError, RuntimeError) as error:  # faiss-cpu lacks classes that this function uses
-        fault = f"the installed FAISS cannot put the index {settings.index} on a GPU ({first_line(error)})"
-        raise ToolkitError(f"faiss_gpu: {fault}. Set faiss_gpu: false.") from error
 
 
-def _is_needed(settings: RetrieveSettings, vectors: StoredVectors) -> bool:
-    sizes = map(int, re.findall(r"(?:PCA|IVF)(\d+)", settings.index))  # dimensions and cells
-    return settings.index != EXACT and len(vectors.rows) > max([settings.index_candidates, *sizes])
-
-
-def _empty(vectors: StoredVectors, factory: str) -> Any:
-    # L2 ranks unit vectors as the dot product does, and the centering by PCA does not change it.
-    metric = faiss.METRIC_L2 if vectors.normalize else faiss.METRIC_INNER_PRODUCT
+@contextmanager
+def _faults(
+    kind: type[ToolkitError], fault: str, do: str, of: tuple[type[Exception], ...] = (RuntimeError,)
+) -> Iterator[None]:
+    """Raise errors of FAISS as errors of this kind, without the location in its source code."""
     try:
-        return faiss.index_factory(vectors.dim, factory, metric)
-    except RuntimeError as error:
-        fault = f"{factory!r} cannot hold vectors of {vectors.dim} dimensions ({_reason(error)})"
-        raise ManifestError(f"retrieve.index: {fault}. {EXACT} searches without an index.") from error
+        yield
+    except of as error:
+        reason = re.sub(r"^Error in .* at \S+:\d+: (Error: )?", "", str(error).strip().splitlines()[-1])
+        raise kind(f"{fault} ({reason}). {do}") from error
 
 
 def _build(vectors: StoredVectors, factory: str) -> Any:
-    count, index, every = len(vectors.rows), _empty(vectors, factory), Vectors({"": vectors})
-    try:
+    count, every = len(vectors.rows), Vectors({"": vectors})
+    # L2 ranks unit vectors as the dot product does, and the centering by PCA does not change it.
+    metric = faiss.METRIC_L2 if vectors.normalize else faiss.METRIC_INNER_PRODUCT
+    fault = f"retrieve.index: {factory!r} cannot hold vectors of {vectors.dim} dimensions"
+    with _faults(ManifestError, fault, f"{EXACT} searches without an index."):
+        index = faiss.index_factory(vectors.dim, factory, metric)
+    fault = f"retrieve.index: {factory!r} cannot be built from {count} vectors of {vectors.dim} dimensions"
+    do = f"Set index: {EXACT}, or index_candidates: {count}: neither builds an index."
+    with _faults(ManifestError, fault, do):
         _train(index, every)
         for start, block in blocks(every, _BLOCK_BYTES):
             require_finite(block, "database", start)
             index.add(block)
-    except RuntimeError as error:
-        fault = f"{factory!r} cannot be built from {count} vectors of {vectors.dim} dimensions ({_reason(error)})"
-        raise ManifestError(
-            f"retrieve.index: {fault}. Set index: {EXACT}, or index_candidates: {count}: neither builds an index."
-        ) from error
     log.info("built index %s of %d vectors", factory, count)
     return index
-
-
-def _write(path: Path, index: Any) -> None:
-    with write_atomic(path) as temporary:
-        try:
-            faiss.write_index(index, str(temporary))
-        except RuntimeError as error:
-            raise ToolkitError(
-                f"{path}: the map's index cannot be written ({_reason(error)}). Free some disk."
-            ) from error
-
-
-def _reason(error: RuntimeError) -> str:
-    """Return the message of a FAISS error without the location in its source code."""
-    return re.sub(r"^Error in .* at \S+:\d+: (Error: )?", "", str(error).strip().splitlines()[-1])
 
 
 def _train(index: Any, vectors: Vectors) -> None:

@@ -288,21 +288,8 @@ def east_north_up(positions: Floats, origin: Floats) -> Floats:
 
 
 def geographic(positions: Floats, origin: Floats) -> Floats:
-    """Return the inverse of `east_north_up`: latitudes, longitudes and altitudes (N, 3) of positions (N, 3).
-
-    B. R. Bowring, "Transformation from spatial to geographical coordinates", Survey Review, 1976, iterated.
-    """
-    x, y, z = (positions @ _local_axes(origin) + _earth_fixed(origin)).T
-    polar_m, from_axis = _EARTH_M * (1 - _FLATTENING), np.hypot(x, y)
-    tangent = z / ((1 - _FLATTENING) * from_axis)  # of the reduced latitude
-    for _ in range(3):
-        reduced = np.arctan(tangent)
-        above = z + _SQUARE / (1 - _SQUARE) * polar_m * np.sin(reduced) ** 3
-        latitude = np.arctan2(above, from_axis - _SQUARE * _EARTH_M * np.cos(reduced) ** 3)
-        tangent = (1 - _FLATTENING) * np.tan(latitude)
-    normal = _EARTH_M / np.sqrt(1 - _SQUARE * np.sin(latitude) ** 2)
-    altitude = from_axis * np.cos(latitude) + z * np.sin(latitude) - _EARTH_M**2 / normal
-    return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), altitude], axis=-1)
+    """Return the inverse of `east_north_up`: latitudes, longitudes and altitudes (N, 3) of positions (N, 3)."""
+    return np.asarray(pycolmap.GPSTransform().enu_to_ellipsoid(np.asarray(positions, np.float64), *origin))
 
 
 def geographic_poses(world_from_cams: Floats, origin: Floats) -> Floats:

@@ -250,8 +250,11 @@ def import_once(
         if inputs.get(name) is not None:
             inputs[f"content of {name}"] = file_fingerprint(inputs[name])
             inputs[name] = str(Path(inputs[name]).resolve())
-    if inputs.get("camera") is not None and _has_cameras(table=options.get("table"), cameras=options.get("cameras")):
-        inputs["camera"] = None  # the table or cameras.txt override it
+    table = options.get("table")
+    if inputs.get("camera") is not None:
+        columns = ["model"] if _is_transforms(table) else [] if table is None else _read_table(Path(table))
+        if options.get("cameras") is not None or "model" in columns or "camera_id" in columns:
+            inputs["camera"] = None  # the table or cameras.txt override it
     try:
         names = list_images(Path(images), READ_SUFFIXES)
     except CaptureError as error:
@@ -259,14 +262,13 @@ def import_once(
     inputs["files of images"] = files_fingerprint([Path(images) / name for name in names])
 
     def make(record: dict[str, Any]) -> ImportReport:
-        file = options.get("table")
-        if file is None or not _is_transforms(file):
+        if table is None or not _is_transforms(table):
             return import_images(images, capture, device, split, unit_m=unit_m, record=record, **options)
-        if Path(images).resolve() != Path(file).resolve().parent:
-            raise ManifestError(f"{split}_images: found {images}, expected the folder of {file}.")
+        if Path(images).resolve() != Path(table).resolve().parent:
+            raise ManifestError(f"{split}_images: found {images}, expected the folder of {table}.")
         if (found := options.get("poses_are", POSE_DIRECTIONS[0])) != POSE_DIRECTIONS[0]:
-            raise ManifestError(f"poses_are: found {found!r}, expected world_from_cam, the direction in {file}.")
-        return import_transforms(file, capture, device, split, own_split=False, unit_m=unit_m, record=record)
+            raise ManifestError(f"poses_are: found {found!r}, expected world_from_cam, the direction in {table}.")
+        return import_transforms(table, capture, device, split, own_split=False, unit_m=unit_m, record=record)
 
     return once(session, inputs, make)
 
@@ -367,14 +369,6 @@ def _camera_of(
     if by_id:
         return next(iter(by_id.values())), "given by cameras.txt"
     return (shared, "given by --camera") if shared is not None else exif_camera(path)[:2]
-
-
-def _has_cameras(table: str | Path | None, cameras: str | Path | None) -> bool:
-    """Return whether the table or cameras.txt give cameras, which override the camera given for all images."""
-    if _is_transforms(table):
-        return True
-    columns = _read_table(Path(table)).columns if table is not None else []
-    return cameras is not None or not {"model", "camera_id"}.isdisjoint(columns)
 
 
 # Tables
@@ -551,7 +545,9 @@ def import_transforms(
             if own_split and name not in held | trained:
                 raise CaptureError("it is in none of train_filenames, val_filenames and test_filenames")
             pose = frame.world_from_named()
-            pose = _undone(pose, *applied) if undo_applied else pose
+            if undo_applied:
+                pose[:3, 3] /= applied[1]
+                pose = np.asarray(np.linalg.inv(applied[0]) @ pose)
             draft.add_image(name, frame.camera(), pose, f"given by {path.name}")
         except (ImageError, CaptureError) as error:
             draft.add_image(name, str(error), None, "")
@@ -646,13 +642,6 @@ def _applied(path: Path, content: Mapping[str, Any]) -> tuple[Floats, float]:
         expected = "expected 3 rows of 4 numbers, a rotation and a translation, and a positive number"
         raise CaptureError(f"{path}: applied_transform, applied_scale: {found}; {expected}.") from None
     return matrix, float(scale)
-
-
-def _undone(pose: Floats, applied: Floats, scale: float) -> Floats:
-    """Return a pose (4, 4) as it was before `applied`, and then `scale`, were applied to its world."""
-    pose = pose.copy()
-    pose[:3, 3] /= scale
-    return np.asarray(np.linalg.inv(applied) @ pose)
 
 
 class _TransformsFrame:

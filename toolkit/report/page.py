@@ -531,27 +531,19 @@ def _listed(queries: pd.DataFrame, caption: str, unit: str) -> Markup:
         rows, names = queries.to_dict("records"), {}
         table["off by"] = [off_by(row, unit=unit) for row in rows]
         table["why"] = [_why(row) for row in rows]
-    table["status"] = queries["status"].str.replace("low_confidence", "low confidence").map(_shortened)
+    status = queries["status"].str.replace("low_confidence", "low confidence")
+    table["status"] = status.where(status.str.len() <= MAX_STATUS, status.str[:MAX_STATUS] + " …")
     table["inliers"] = queries["num_inliers"]
     names |= {"p_correct": "stated to be right", "rival_support": "support of a rival"}
     known = queries.filter([*names]).dropna(axis="columns", how="all").rename(columns=names)
     formats: dict[str, Write] = dict.fromkeys(["stated to be right", "support of a rival"], _share)
-    names_of_images = queries["image"].fillna("").map(_shown_names)
-    return _table(table.join(known).assign(image=names_of_images), caption, formats)
-
-
-def _shortened(status: str) -> str:
-    return status if len(status) <= MAX_STATUS else f"{status[:MAX_STATUS]} …"
+    images = queries["image"].fillna("").str.split(";")
+    shown = [first + (f" and {len(more)} more" if more else "") for first, *more in images]
+    return _table(table.join(known).assign(image=shown), caption, formats)
 
 
 def _queries(table: pd.DataFrame) -> "pd.Series[str]":
     return table["query_device"] + " in " + table["map_device"] + " map"
-
-
-def _shown_names(images: str) -> str:
-    """Return the name of a query's first image, and how many more there are."""
-    first, *more = images.split(";")
-    return first + (f" and {len(more)} more" if more else "")
 
 
 def _why(row: dict[str, Any]) -> str:

@@ -382,7 +382,8 @@ def record_localizations(
     with open_recording(out, name, _layout(name, poses, up, len(localizations.names) > 0)) as stream:
         stream.log("world", world_axes(up), static=True)
         log_points(stream, np.asarray(points) + shift, colors)
-        _log_map_cameras(stream, poses, size)
+        cameras = rr.LineStrips3D(pyramids(poses, size).astype(np.float32), colors=rgb(MAP))
+        stream.log("world/map_cameras", cameras, static=True)
         _log_overview(stream, localizations, shift)
         for kind, color in (("odometry", ORANGE), ("frames", SKY)):
             if tracks and tracks.get(kind):
@@ -415,12 +416,6 @@ def _layout(name: str, poses: Floats, up: Floats, has_queries: bool) -> Any:
     side = rrb.Vertical(query, references, about, row_shares=[4, 4, 2])
     panel = rrb.TimePanel(state="collapsed", timeline=QUERY, play_state="paused")
     return rrb.Blueprint(rrb.Horizontal(scene, side, column_shares=[3, 2]), panel, collapse_panels=True)
-
-
-def _log_map_cameras(stream: rr.RecordingStream, poses: Floats, size: float) -> None:
-    """Log the map's cameras as small pyramids, all in one entity."""
-    lines = rr.LineStrips3D(pyramids(poses, size).astype(np.float32), colors=rgb(MAP))
-    stream.log("world/map_cameras", lines, static=True)
 
 
 def _log_overview(stream: rr.RecordingStream, queries: Localizations, shift: Floats) -> None:
