@@ -10,7 +10,15 @@ import pytest
 
 from toolkit.capture import Capture
 from toolkit.geometry import pose_error
-from toolkit.pose.pnp import WEIGHTS, bounded_by_deviation, bounded_by_rivals, probability_right
+from toolkit.pose.pnp import (
+    STRAYS,
+    WEIGHTS,
+    bounded_by_deviation,
+    bounded_by_map,
+    bounded_by_rivals,
+    clarity_of_support,
+    probability_right,
+)
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "confidence.py"
 
@@ -109,6 +117,27 @@ def test_deviations_bound_the_probability() -> None:
     assert bounded_by_deviation(1.0, np.nan, 0.1) == 0
     bounds = [bounded_by_deviation(1.0, position_std, 0.1) for position_std in np.linspace(0, 2, 11)]
     assert bounds == sorted(bounds, reverse=True)
+
+
+def test_noise_of_the_map_bounds_the_probability() -> None:
+    def covariance(rotation_deg: float, position: float) -> np.ndarray:
+        return np.diag(np.repeat([np.radians(rotation_deg) ** 2 / 3, position**2 / 3], 3))
+
+    assert bounded_by_map(0.97, np.zeros((6, 6))) == 0.97
+    assert bounded_by_map(1.0, covariance(0.1, 0.2)) > 0.99
+    assert bounded_by_map(1.0, covariance(1e3, 1e3)) == pytest.approx(1 - STRAYS), "most poses do not stray"
+    assert bounded_by_map(1.0, covariance(5.0, 0.1)) < 0.95
+    for unit in ((0.0, 1.0), (10.0, 0.0)):
+        bounds = [bounded_by_map(1.0, covariance(size * unit[0], size * unit[1])) for size in np.linspace(0, 2, 11)]
+        assert bounds == sorted(bounds, reverse=True)
+
+
+def test_support_tells_less_in_a_noisy_map() -> None:
+    clarity = [clarity_of_support(noise_deg, 0.17) for noise_deg in (0.0, 0.1, 0.3, 1.0)]
+    assert clarity[:2] == [1.0, 1.0]
+    assert 1 > clarity[2] > clarity[3] > 0
+    assert bounded_by_rivals(1.0, [1.0], clarity[3]) == pytest.approx(1 / 2)
+    assert bounded_by_rivals(1.0, [0.6], 1.0) > 0.99 > bounded_by_rivals(1.0, [0.6], clarity[2])
 
 
 def test_a_capture_is_made_hard(confidence: ModuleType, small_capture: Path, tmp_path: Path) -> None:

@@ -17,10 +17,10 @@ from toolkit import geometry
 from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, LocalFeatures
 from toolkit.features.matching import MutualMatcher, PairMatches, unit_descriptors
 from toolkit.manifest import PnpSettings
-from toolkit.mapping.local_map import LocalMap
+from toolkit.mapping.local_map import Consistency, LocalMap
 from toolkit.pose import map_matching as matches
 from toolkit.pose import pnp
-from toolkit.pose.base import CAMERA, Prior, QueryResult, References, Status
+from toolkit.pose.base import CAMERA, NOISE, Prior, QueryResult, References, Status
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import (
     FIRST_REFERENCES,
@@ -639,6 +639,23 @@ def test_more_noise_is_more_uncertainty(room: World) -> None:
         seen = room.look(PINHOLE, QUERY, noise_px=noise)
         stds.append(ask(room.localizer(), [PINHOLE], np.eye(4)[None], [seen], [REFERENCES]).position_std)
     assert 2 < stds[1] / stds[0] < 6
+
+
+def test_noise_of_the_maps_poses_leaves_far_scenes_open(room: World) -> None:
+    """At the same noise, a scene six times as far lets the pose move six times as far."""
+    far = World.build(6 * room.points, MAP_POSES)
+
+    def found(world: World, noise_deg: float) -> QueryResult:
+        noisy = world.local_map.judged(Consistency("consistent", direction_noise_deg=noise_deg))
+        localizer = PnpLocalizer([MappedFeatures(noisy, world.features)])
+        return ask(localizer, [PINHOLE], np.eye(4)[None], [world.look(PINHOLE, QUERY)], [REFERENCES])
+
+    for world, noise_deg in ((room, 0.0), (far, 0.0), (room, 0.4)):
+        assert found(world, noise_deg).status == "ok"
+    refused = found(far, 0.4)
+    assert (refused.status, refused.reason) == ("low_confidence", NOISE)
+    assert refused.p_correct < 0.99
+    assert "refine_poses" in refused.remark
 
 
 @pytest.mark.slow

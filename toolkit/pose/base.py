@@ -23,6 +23,8 @@ from toolkit.geometry import Floats, Ints
 
 CAMERA = "camera?"
 """Reason of a pose whose matches contradict the intrinsics of the query."""
+NOISE = "noise of the map's poses"
+"""Reason of a pose that would be `ok` if the poses of the map were exact."""
 AGREEMENT = (5.0, 0.5)  # degrees, meters: two poses within both confirm each other
 _NAMES = ("images", "references", "rejected")
 _STORED: dict[str, tuple[type[np.generic], tuple[int, ...]]] = {

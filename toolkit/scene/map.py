@@ -40,6 +40,7 @@ from toolkit.mapping.local_map import Consistency, LocalMap, map_path
 from toolkit.mapping.pose_consistency import NOMINAL_DEPTH, USUAL_DEPTHS_M
 from toolkit.pose.base import (
     CAMERA,
+    NOISE,
     SEARCH_DEG,
     Localizer,
     NearestLocalizer,
@@ -49,6 +50,7 @@ from toolkit.pose.base import (
     QueryMatches,
     QueryResult,
     References,
+    Rival,
     RoughPose,
     Status,
     View,
@@ -56,7 +58,7 @@ from toolkit.pose.base import (
 )  # fmt: skip
 from toolkit.pose.local_triangulation import OnDemandLocalizer, PosedImages
 from toolkit.pose.map_matching import MappedFeatures
-from toolkit.pose.pnp import RIVAL_DISTANCE, PnpLocalizer, bounded_by_rivals
+from toolkit.pose.pnp import RIVAL_DISTANCE, PnpLocalizer, bounded_by_rivals, clarity_of_support
 from toolkit.prediction.feed_forward import FeedForwardLocalizer, depth_of_images
 from toolkit.prediction.hybrid import HybridLocalizer, LiftingLocalizer, lifts
 from toolkit.prediction.interface import Predictor
@@ -382,7 +384,7 @@ class Map:
 
     def is_unsure(self, result: QueryResult) -> bool:
         """Tell whether fallback features, if there are any, might find a better pose."""
-        if self.fallback is None or result.misfit:  # no features repair wrong intrinsics
+        if self.fallback is None or result.misfit or result.reason == NOISE:  # no features repair that
             return False
         limit = MAX_SURE_STD_M * (1.0 if self.settings.unit else self.length)
         # A pose without matches has no deviation (NaN) and counts as precise.
@@ -444,8 +446,13 @@ class Map:
 
     def _finds_rival(self, result: QueryResult) -> bool:
         """Tell whether a pose cannot be `ok` beside its rivals, even if all else is certain."""
-        beside = bounded_by_rivals(1.0, [rival.support for rival in result.rivals])
+        beside = self._beside(1.0, result.rivals)
         return result.status is Status.LOW_CONFIDENCE and beside < self.settings.pnp.ok_probability
+
+    def _beside(self, probability: float, rivals: Sequence[Rival]) -> float:
+        """Return the probability that a pose is correct, bounded by its rivals in this map."""
+        clarity = clarity_of_support(self.consistency.direction_noise_deg, self.settings.pnp.max_error_deg)
+        return bounded_by_rivals(probability, [rival.support for rival in rivals], clarity)
 
     def _with_rivals_of(self, first: QueryResult, result: QueryResult) -> QueryResult:
         """Return a result that also has the rivals of an `ok` first one, whose places few references may not show."""
@@ -454,7 +461,7 @@ class Map:
         if not forgotten or result.world_from_rig is None:
             return result
         rivals = sorted([*result.rivals, *forgotten], key=lambda rival: -rival.support)
-        probability = bounded_by_rivals(result.p_correct, [rival.support for rival in rivals])
+        probability = self._beside(result.p_correct, rivals)
         return replace(
             result,
             status=Status.LOW_CONFIDENCE if probability < self.settings.pnp.ok_probability else result.status,
