@@ -255,7 +255,7 @@ class _SessionCheck:
     def _check_steps(self) -> None:
         """Report times that seem to have another unit than microseconds; those that imports made are from EXIF."""
         record = self.session.path / IMPORT_RECORD
-        if record.is_file() and "as given" not in str(read_json(record).get("timestamps")):
+        if record.is_file() and "as given" not in (read_json(record).get("timestamps") or ()):
             return
         frames = self.session.images[["timestamp"]].assign(subsession=self.session.subsession_of())
         steps = [np.diff(np.unique(times_of(one))) for _, one in frames.groupby("subsession")]
