@@ -89,11 +89,11 @@ docs: $(INSTALLED)  ## build the documentation: build/docs/index.html
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "Documentation: build/docs/index.html"
 
-docs-images: $(INSTALLED)  ## draw the documentation's pictures from a demo run; first: make browser-setup
-	$(BIN)/python -m docs.make_images
+docs-images: $(INSTALLED)  ## draw the documentation's pictures from a demo run (PHOTOS=folder: that of photographs, too); first: make browser-setup
+	$(BIN)/python -m docs.make_images $(PHOTOS)
 
-docs-view: $(INSTALLED)  ## draw the documentation's picture of the localization view; needs mesa-vulkan-drivers
-	$(BIN)/python -m docs.view_image
+docs-view: $(INSTALLED)  ## draw the documentation's pictures of the viewer (PHOTOS=folder: as above); needs mesa-vulkan-drivers
+	$(BIN)/python -m docs.view_image $(PHOTOS)
 
 # Your changes to a copy stay: a newer notebook replaces it only if you have not changed it.
 lab: $(INSTALLED)  ## open JupyterLab on your own copies of the notebooks, in lab/; LAB_ARGS="--port 9999" or others
