@@ -159,18 +159,24 @@ def rows_of_run(capture_path: Path, run: Path) -> pd.DataFrame:
     """Return a row for each query of all pairs of a finished run."""
     from toolkit.capture import Capture, Trajectory
     from toolkit.evaluate import pose_errors
-    from toolkit.files import SceneFiles
+    from toolkit.files import SceneFiles, read_map_record
+    from toolkit.manifest import PnpSettings
+    from toolkit.pose.pnp import clarity_of_support
 
     capture = Capture.open(capture_path)
     tables = []
     for path in sorted(SceneFiles(run, capture.name).poses_dir.glob("*.csv")):
-        truth = capture[f"{path.stem.rpartition('_query_')[2]}_query"].ground_truth
+        of_map, query_device = path.stem.rsplit("_query_", 1)
+        noise_deg = read_map_record(path.with_name(f"{of_map}.json"))["direction_noise_deg"]
+        clarity = clarity_of_support(noise_deg, PnpSettings().max_error_deg)
+        truth = capture[f"{query_device}_query"].ground_truth
         assert truth is not None, f"{capture_path} has no ground truth"
         table = pd.read_csv(path, dtype={"device_id": str}).rename(columns={"position_std_m": "position_std"})
         rotation_deg, distance_m = pose_errors(Trajectory.read(path.with_suffix(".txt")), truth, table)
         wrong = (rotation_deg > WRONG[0]) | (distance_m > WRONG[1])
         refused = table["status"].str.startswith("low_confidence: ")
         made = {"pair": path.stem, "posed": np.isfinite(distance_m), "wrong": wrong, "refused": refused}
+        made |= {"ok": table["status"] == "ok", "clarity": clarity}
         tables.append(table.assign(**made, rotation_error_deg=rotation_deg, translation_error_m=distance_m))
     return pd.concat(tables, ignore_index=True)
 
@@ -209,7 +215,7 @@ def stated(rows: pd.DataFrame, weights: NDArray[np.float64]) -> NDArray[np.float
     evidence = {name: rows[name].to_numpy(np.float64) for name in EVIDENCE}
     alone = np.where(rows["posed"], probability_right(evidence, weights), 0.0)
     rivals = [[rival] if rival > 0 else [] for rival in rows["rival_support"]]
-    bounded = map(bounded_by_rivals, alone, rivals)
+    bounded = map(bounded_by_rivals, alone, rivals, rows["clarity"])
     return np.array(list(map(bounded_by_deviation, bounded, rows["position_std"], rows["rotation_std_deg"])))
 
 
@@ -238,7 +244,7 @@ def rival_slopes(rows: pd.DataFrame) -> tuple[float, float]:
     loss, holds = [], []
     for slope in SLOPES:
         with patch.object(pnp, "RIVAL_SLOPE", slope):
-            odds = pnp.odds_of_rivals(support)
+            odds = pnp.odds_of_rivals(support, rows["clarity"].to_numpy(np.float64))
         judged = judge(rows, np.minimum(most, 1 / (1 + odds)))
         loss.append(np.log1p(np.where(rows["wrong"], 1 / odds, odds))[rival].sum())
         holds.append(judged["wrong"] <= (1 - OK) * judged["accepted"])
@@ -270,8 +276,10 @@ def markdown(rows: pd.DataFrame, held_out: list[str]) -> str:
             name = f"{group} (held out)" if group in held_out else str(group)
             table.append([name, f"{len(part)}", f"{part['posed'].sum()}", f"{(part['posed'] & part['wrong']).sum()}",
                           f"{judged['accepted']}", f"{judged['wrong']}", f"{100 * judged['upper']:.2f} %",
-                          f"{100 * judged['found']:.1f} %"])  # fmt: skip
-        header = [column, "queries", "posed", "wrong", "ok", "ok and wrong", "at most", "right ones called ok"]
+                          f"{100 * judged['found']:.1f} %", f"{part['ok'].sum()}",
+                          f"{(part['ok'] & part['wrong']).sum()}"])  # fmt: skip
+        header = [column, "queries", "posed", "wrong", "ok", "ok and wrong", "at most", "right ones called ok",
+                  "`ok` today", "`ok` today and wrong"]  # fmt: skip
         text += [markdown_table(header, table), ""]
     posed = rows[rows["posed"] & ~rows["refused"]]
     bins = pd.cut(probability[posed.index], BINS, include_lowest=True)

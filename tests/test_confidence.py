@@ -39,7 +39,7 @@ def confidence() -> ModuleType:
 def rows(count: int, **columns: object) -> pd.DataFrame:
     plain = {"scene": "a", "posed": True, "wrong": False, "num_inliers": 100, "inlier_ratio": 0.5, "coverage": 0.5}
     plain |= {"rival_support": 0.0, "agreement": 0, "position_std": 0.01, "rotation_std_deg": 0.1}
-    plain |= {"refused": False, "way": "as it is", "escalated": False}
+    plain |= {"refused": False, "way": "as it is", "escalated": False, "ok": True, "clarity": 1.0}
     return pd.DataFrame([plain | columns] * count)
 
 
@@ -79,6 +79,13 @@ def test_what_is_not_known_is_not_accepted(confidence: ModuleType) -> None:
     sure = np.array([100.0, *[0.0] * 7])
     assert confidence.judge(unknown, confidence.stated(unknown, sure))["accepted"] == 0
     assert confidence.judge(rows(5, rival_support=0.9), confidence.stated(rows(5), sure))["accepted"] == 0
+
+
+def test_rivals_count_more_in_a_noisy_map(confidence: ModuleType) -> None:
+    sure = np.array([100.0, *[0.0] * 7])
+    beside = {"rival_support": 0.6}
+    exact, noisy = (confidence.stated(rows(1, **beside, clarity=clarity), sure)[0] for clarity in (1.0, 0.4))
+    assert exact > 0.99 > noisy > 0.5
 
 
 def test_the_share_of_wrong_ones_is_bounded(confidence: ModuleType) -> None:

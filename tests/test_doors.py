@@ -27,7 +27,12 @@ def quiet(*_: object, **__: object) -> None:
     pass
 
 
-NETWORK = {"name": "da3-small", "checkpoint": "$MADE/da3-small.safetensors", "num_references": 3}
+# With made-up weights, small inputs prove as much.
+NETWORK = {"name": "da3-small", "checkpoint": "$MADE/da3-small.safetensors", "num_references": 2}
+SUPERPOINT = {
+    "kinds": ["superpoint"], "checkpoint": "$MADE/superpoint.safetensors",
+    "superpoint": {"max_long_side": 320, "max_keypoints": 512},
+}  # fmt: skip
 METHODS: dict[str, dict[str, Any]] = {
     "pnp": {"method": "pnp", "pnp": {"max_error_deg": 0.4}},
     "nearest": {"method": "nearest"},
@@ -37,14 +42,10 @@ METHODS: dict[str, dict[str, Any]] = {
     "aliked, lightglue": {"method": "pnp", "features": {"kinds": ["aliked"]}},
     "sift and aliked": {"method": "pnp", "features": {"kinds": ["sift", "aliked"]}},
     "superpoint": {
-        "method": "pnp", "features": {"kinds": ["superpoint"], "checkpoint": "$MADE/superpoint.safetensors"},
-        "matcher": {"name": "mutual"},
+        "method": "pnp", "features": SUPERPOINT, "matcher": {"name": "mutual"},
     },
     "superpoint, lightglue": {
-        "method": "pnp", "features": {
-            "kinds": ["superpoint"], "checkpoint": "$MADE/superpoint.safetensors", "superpoint": {"max_keypoints": 512},
-        },
-        "matcher": {"checkpoint": "$MADE/lightglue.safetensors"},
+        "method": "pnp", "features": SUPERPOINT, "matcher": {"checkpoint": "$MADE/lightglue.safetensors"},
     },
     "a network, feed_forward": {"method": "feed_forward", "predictor": NETWORK},
     "a network, hybrid": {"method": "hybrid", "predictor": NETWORK},

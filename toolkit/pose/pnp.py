@@ -163,7 +163,7 @@ def bounded_by_rivals(probability: float, supports: Sequence[float], clarity: fl
     return float(min(probability, 1 / (1 + odds_of_rivals(supports, clarity).sum())))
 
 
-def odds_of_rivals(supports: Sequence[float], clarity: float = 1.0) -> Floats:
+def odds_of_rivals(supports: Sequence[float] | Floats, clarity: float | Floats = 1.0) -> Floats:
     """Return how probable each rival is, relative to the pose, from its relative support: 1 for equal support."""
     relative = np.clip(np.array(supports, np.float64), 1e-3, 1.0)
     return np.asarray(np.exp(-RIVAL_SLOPE * clarity * (1 / relative - 1)), np.float64)
