@@ -3,6 +3,7 @@
 Nothing here localizes, except `what_if` of the results.
 """
 
+import logging
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -52,6 +53,8 @@ from toolkit.scene.query import Located, best_ranks
 
 if TYPE_CHECKING:
     from toolkit.figures.answers import Answer
+
+log = logging.getLogger(__name__)
 
 WORST = "worst"
 """Alias for the number of the worst query."""
@@ -175,6 +178,8 @@ class InspectedPair:
         names = self.localized.query_session.image_names
         images = {names[row]: number for number, rows in enumerate(self.localized.rows) for row in rows}
         number = find_query(query, images, len(self))
+        if older := why_older(self.localized.results.path, "localize", missing=False):
+            log.warning("%s", older)
         context = Located(partial(self._answer, number), partial(self._open, number))
         return self._answer(number, replace(self.localized.results[number], context=context))
 
