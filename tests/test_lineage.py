@@ -323,6 +323,13 @@ def test_no_reader_combines_an_artifact_with_an_older_one(
 
 
 @pytest.mark.slow
+def test_a_copied_run_is_looked_at_with_its_own_references(linked: SceneFiles, released_weights: None) -> None:
+    copied = SceneFiles(copy_linked(linked.run, linked.run.with_name("copied")), linked.scene)
+    pair = InspectedPair("ios", "hl", copied.poses_dir)
+    assert pair.retrieval.resolve() == copied.retrieval("ios", "hl").resolve(), "the record names that of the first run"
+
+
+@pytest.mark.slow
 def test_what_only_left_out_says_older_and_the_next_run_mends_it(linked: SceneFiles, small_capture: Path) -> None:
     manifest = linked.run.parent / f"{linked.run.name}.yaml"
     manifest.write_text(f"captures: ['{small_capture}']\noutput_root: .\n")

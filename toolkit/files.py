@@ -325,12 +325,17 @@ def changed_sources(artifact: str | Path) -> list[Path]:
     two do not belong together. An artifact without a record is from another tool, and as current as can be known. A
     file of the capture that is missing has not changed: results are read where their capture is not.
     """
+    found = [(path, content, _content(path)) for path, content in sources_of(artifact).items()]
+    # A file of the capture, which alone has an absolute path in the record, may be elsewhere.
+    of_capture = _read_record(artifact).get("made_from", ())
+    return [path for path, content, now in found if now != content and (now or str(path) not in of_capture)]
+
+
+def sources_of(artifact: str | Path) -> dict[Path, Any]:
+    """Return the files that an artifact was made from, in a copied run those of the copy, with a hash of each."""
     recorded = _read_record(artifact).get("made_from")
     sources = recorded if isinstance(recorded, dict) else {}
-    paths = [(Path(os.path.normpath(Path(artifact).parent / name)), sources[name]) for name in sources]
-    found = [(path, content, _content(path)) for path, content in paths]
-    # A file of the capture is recorded by its absolute path.
-    return [path for path, content, now in found if now != content and (now or str(path) not in sources)]
+    return {Path(os.path.normpath(Path(artifact).parent / name)): content for name, content in sources.items()}
 
 
 def why_older(

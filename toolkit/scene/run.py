@@ -28,6 +28,7 @@ from toolkit.files import (
     read_references,
     relative_url,
     require_current,
+    sources_of,
     why_older,
 )
 from toolkit.geometry import Ints
@@ -159,7 +160,8 @@ class InspectedPair:
         files = self._files = SceneFiles(self._h5.parents[2], self._h5.parents[1].name)
         self._features_dir, self._map_dir = Path(features_dir or files.features), Path(map_dir or files.maps)
         self.settings, paths, _ = how_localized(self._h5)
-        self.retrieval = Path(paths[RETRIEVAL]) / f"{self._h5.stem}.jsonl"
+        stored = (path for path in sources_of(self._h5.with_suffix(".txt")) if path.suffix == ".jsonl")
+        self.retrieval = next(stored, Path(paths[RETRIEVAL]) / f"{self._h5.stem}.jsonl")
         capture = Capture.from_sessions_root(sessions_root or paths[SESSIONS_ROOT])
         self.localized = LocalizedPair.open(capture, map_device, query_device, poses_dir, self._map_dir)
         self.names = self.localized.localizations.names
