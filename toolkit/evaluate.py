@@ -250,12 +250,9 @@ def _unreadable(capture: Capture, session_id: str) -> str:
 
 
 def write_evaluation(
-    evaluation: Evaluation,
-    out_dir: str | Path,
-    settings: dict[str, Any],
-    sources: Sequence[Path] = (),
+    evaluation: Evaluation, out_dir: str | Path, settings: dict[str, Any], sources: Sequence[Path] = (),
     truths: Sequence[Path] = (),
-) -> None:
+) -> None:  # fmt: skip
     """Write the tables as CSV, the figures as PNG, and settings, `sources` and `truths` to the record of recall.csv."""
     out = Path(out_dir)
     tables: dict[str, Any] = {name: getattr(evaluation, attribute) for name, attribute in TABLES.items()}

@@ -338,9 +338,8 @@ class _Pair:
             _write_poses(self.file("txt"), rows, stage.settings)
         if update_attributes(self.file("h5"), h5_attributes) or not skipped:
             files = self.file("txt"), record, [self.file("csv"), self.file("h5")]
-            sources = [self.retrieval, *maps]
-            captured = [*session_files(stage.capture[f"{self.devices[0]}_map"]), *session_files(self.session)]
-            write_sidecar(*files, made_from=sources, captured=captured, unfinished=unfinished)
+            captured = session_files(stage.capture[f"{self.devices[0]}_map"], self.session)
+            write_sidecar(*files, made_from=[self.retrieval, *maps], captured=captured, unfinished=unfinished)
         return skipped
 
     def _made_from(self, maps: Sequence[Path]) -> dict[str, Any]:

@@ -378,9 +378,9 @@ SESSION_FILES = "sensors.txt", "images.txt", "rigs.txt", "trajectories.txt"
 """Files of the calibration, the images and the poses of a session; not each session has all of them."""
 
 
-def session_files(session: Session) -> list[Path]:
+def session_files(*sessions: Session) -> list[Path]:
     """Return the existing files of `SESSION_FILES`."""
-    return [session.path / name for name in SESSION_FILES if (session.path / name).exists()]
+    return [path for one in sessions for name in SESSION_FILES if (path := one.path / name).exists()]
 
 
 def session_fingerprint(session: Session) -> str:
