@@ -1,6 +1,8 @@
 """Artifacts that belong together: what is older than what it was made from is made again, or withheld and named."""
 
+import io
 import json
+import logging
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -19,9 +21,12 @@ from toolkit.files import (
     SceneFiles,
     changed_sources,
     file_fingerprint,
+    fingerprint,
     older_files,
+    read_json,
     read_sidecar,
     require_current,
+    sidecar_path,
     why_older,
     write_sidecar,
 )
@@ -91,6 +96,22 @@ def test_a_missing_source_is_told_from_a_changed_one(made: tuple[Path, Path, Pat
     assert older_files(evaluation.parent, "evaluate")
 
 
+def test_files_of_the_capture_count_where_they_are(made: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    poses, cameras = made[1], tmp_path / "capture" / "ios_query" / "sensors.txt"
+    cameras.parent.mkdir(parents=True)
+    cameras.write_text("cameras")
+    write_sidecar(poses, {}, made_from=[made[0]], captured=[cameras])
+    moved = tmp_path.parent / f"{tmp_path.name}-moved"
+    shutil.copytree(tmp_path / "poses", moved / "elsewhere" / "poses")
+    assert not changed_sources(poses)
+    cameras.write_text("other cameras")
+    assert "is of an older ios_query/sensors.txt" in why_older(poses, "localize")
+    assert changed_sources(moved / "elsewhere" / "poses" / poses.name)[-1:] == [cameras], "a run moves alone"
+    assert not why_older(poses, "localize", ["/ios_map/sensors.txt"])
+    cameras.unlink()
+    assert not changed_sources(poses)
+
+
 def test_a_file_of_another_tool_has_no_sources(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("a")
     assert not changed_sources(tmp_path / "a.txt")
@@ -128,6 +149,16 @@ def compared(files: SceneFiles, capture: Path) -> str:
 
 def inspected_again(files: SceneFiles, capture: Path) -> str:
     return str(InspectedPair("ios", "hl", files.poses_dir).look().result.what_if())
+
+
+def looked_at(files: SceneFiles, capture: Path) -> str:
+    told = io.StringIO()
+    logging.getLogger("toolkit").addHandler(handler := logging.StreamHandler(told))
+    try:
+        InspectedPair("ios", "hl", files.poses_dir).look()
+    finally:
+        logging.getLogger("toolkit").removeHandler(handler)
+    return told.getvalue()
 
 
 def inspected(files: SceneFiles, capture: Path) -> str:
@@ -176,6 +207,12 @@ def linked_report(files: SceneFiles, capture: Path) -> str:
 
 POSES, TABLE, REFERENCES, MAP, VECTORS = "poses txt", "poses csv", "references", "map", "vectors"
 FEATURES, RECORD = "features", "run.json"
+CAMERAS, MAP_POSES, TRUTH = "cameras of queries", "poses of the map", "ground truth"
+CAPTURED = {
+    CAMERAS: "/hl_query/sensors.txt",
+    MAP_POSES: "/ios_map/trajectories.txt",
+    TRUTH: "/hl_query/proc/alignment_trajectories.txt",
+}
 READERS = [
     (POSES, reported, "Not shown: recall.csv is of an older poses/"),
     (TABLE, reported, "Not shown: recall.csv is of an older poses/"),
@@ -204,6 +241,17 @@ READERS = [
     (FEATURES, exported_map, "of other images or features: run the localize stage again"),
     (FEATURES, exported_matches, "of other images or features: run the localize stage again"),
     (TABLE, linked_report, "is of an older poses/"),
+    (CAMERAS, reported, "is of an older hl_query/sensors.txt: run the localize stage again"),
+    (CAMERAS, visualized, "run the localize stage again"),
+    (CAMERAS, looked_at, "is of an older hl_query/sensors.txt: run the localize stage again"),
+    (CAMERAS, inspected_again, "run the localize stage again"),
+    (CAMERAS, exported_poses, "run the localize stage again"),
+    (CAMERAS, exported_geo, "run the localize stage again"),
+    (CAMERAS, submitted, "run the localize stage again"),
+    (CAMERAS, opened, "Map("),  # it has none of the queries' cameras
+    (MAP_POSES, opened, "is of an older ios_map/trajectories.txt: run the localize stage again"),
+    (TRUTH, reported, "Not shown: recall.csv is of an older proc/alignment_trajectories.txt"),
+    (TRUTH, compared, "run the evaluate stage again"),
     (RECORD, linked_report, f"Write it again: {COMMAND} report"),
 ]
 
@@ -222,6 +270,14 @@ def change(files: SceneFiles, what: str) -> None:
         with Items(next((files.features / "ios_map").glob("sift-*"))) as items:
             first = next(iter(items))
             items.add(first, "another picture", items[first])
+        return
+    if what in CAPTURED:
+        artifact, source = {TRUTH: files.evaluation / "recall.csv"}.get(what, poses), CAPTURED[what]
+        record = read_json(path := sidecar_path(artifact))
+        (name,) = (name for name in record["made_from"] if name.endswith(source))
+        record["made_from"][name] = "as it was then"
+        path.unlink()
+        path.write_text(json.dumps(record | {"sources": fingerprint(record["made_from"])}))
         return
     if what == RECORD:
         record = files.run / "run.json"
@@ -264,6 +320,13 @@ def test_no_reader_combines_an_artifact_with_an_older_one(
     except ArtifactError as error:
         text = str(error)
     assert said in text
+
+
+@pytest.mark.slow
+def test_a_copied_run_is_looked_at_with_its_own_references(linked: SceneFiles, released_weights: None) -> None:
+    copied = SceneFiles(copy_linked(linked.run, linked.run.with_name("copied")), linked.scene)
+    pair = InspectedPair("ios", "hl", copied.poses_dir)
+    assert pair.retrieval.resolve() == copied.retrieval("ios", "hl").resolve(), "the record names that of the first run"
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.names import in_order
-from toolkit.capture.tables import POSES_UNIT
+from toolkit.capture.tables import ALIGNED, POSES_UNIT
 from toolkit.errors import ArtifactError, CaptureError, ToolkitError
 from toolkit.figures.evaluation import Evaluation, SequencePair, draw_evaluation, warn_of_older
 from toolkit.figures.style import save_figure
@@ -106,7 +106,7 @@ def evaluate_scene(
     capture = Capture.from_sessions_root(sessions_root)
     devices = capture.devices_with("map", map_device), capture.devices_with("query", query_device)
     rows: dict[str, list[dict[str, Any]]] = {"recall": [], "retrieval": [], "losses": []}
-    errors, messages, sources = list[pd.DataFrame](), list[str](), list[Path]()
+    errors, messages, sources, truths = list[pd.DataFrame](), list[str](), list[Path](), list[Path]()
     references_dir = retrieval_dir and (reranked_dir or retrieval_dir)
     for query in devices[1]:
         maps = [map_ for map_, _ in _chosen((devices[0], [query]), pairs)]
@@ -115,6 +115,7 @@ def evaluate_scene(
         reason = ""
         try:
             session = capture[f"{query}_query"]
+            truths += filter(Path.is_file, [session.path / ALIGNED])
             keys, truth = _queries_with_truth(session, queries, messages)
             tables = (_table_of(poses_dir, capture.name, map_, query) for map_ in maps)
             messages += metrics.camera_messages(session, [table for table in tables if table is not None])
@@ -183,7 +184,7 @@ def evaluate_scene(
         logger.warning(message)
     if out_dir is not None:
         record = {"poses": str(poses_dir), "queries": queries, "at": at, **settings.model_dump()}
-        write_evaluation(evaluation, out_dir, record | {"messages": evaluation.messages}, sources)
+        write_evaluation(evaluation, out_dir, record | {"messages": evaluation.messages}, sources, truths)
     return evaluation
 
 
@@ -249,9 +250,10 @@ def _unreadable(capture: Capture, session_id: str) -> str:
 
 
 def write_evaluation(
-    evaluation: Evaluation, out_dir: str | Path, settings: dict[str, Any], sources: Sequence[Path] = ()
-) -> None:
-    """Write the tables as CSV, the figures as PNG, and settings and `sources` to the sidecar of recall.csv."""
+    evaluation: Evaluation, out_dir: str | Path, settings: dict[str, Any], sources: Sequence[Path] = (),
+    truths: Sequence[Path] = (),
+) -> None:  # fmt: skip
+    """Write the tables as CSV, the figures as PNG, and settings, `sources` and `truths` to the record of recall.csv."""
     out = Path(out_dir)
     tables: dict[str, Any] = {name: getattr(evaluation, attribute) for name, attribute in TABLES.items()}
     if not len(evaluation.sequences):
@@ -270,7 +272,7 @@ def write_evaluation(
                 content.to_csv(temporary, index=False)
         else:
             save_figure(content, path)
-    write_sidecar(out / "recall.csv", settings, written[1:], made_from=sources)
+    write_sidecar(out / "recall.csv", settings, written[1:], made_from=sources, captured=truths)
     logger.info("Evaluated %d of %d pairs: %s", (evaluation.recall["state"] == "evaluated").sum(),
                 len(evaluation.recall), out / "recall.csv")  # fmt: skip
 

@@ -15,7 +15,7 @@ import secrets
 import shutil
 import tempfile
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -259,6 +259,7 @@ def write_sidecar(
     others: Iterable[str | Path] = (),
     *,
     made_from: Iterable[str | Path] = (),
+    captured: Iterable[str | Path] = (),
     unfinished: bool = False,
 ) -> None:
     """Record the settings and inputs of the artifact `path`, and the checksums of its files.
@@ -267,15 +268,18 @@ def write_sidecar(
 
     Args:
         others: further files beside it that belong to the artifact.
-        made_from: existing files that it was made from, see `changed_sources`.
+        made_from: existing files of the run that it was made from, see `changed_sources`.
+        captured: likewise existing files of the capture.
         unfinished: a part of the artifact failed and must be tried again: this run uses it, later runs do not reuse it.
     """
     files = [Path(path), *map(Path, others)]
+    sources = {os.path.relpath(one, Path(path).parent): _content(one) for one in made_from}
+    sources |= {str(Path(one).resolve()): _content(one) for one in captured}  # run and capture move apart
     record = {
         "version": __version__,
         "fingerprint": fingerprint(settings),
         "files": {file.name: [file.stat().st_size, checksum(file)] for file in files},
-        "made_from": (sources := {os.path.relpath(one, Path(path).parent): _content(one) for one in made_from}),
+        "made_from": sources,
         "sources": fingerprint(sources),
         **({"unfinished": True} if unfinished else {}),
         "settings": settings,
@@ -318,27 +322,35 @@ def changed_sources(artifact: str | Path) -> list[Path]:
     """Return the files that an artifact was made from and that have changed since, or are missing.
 
     Whatever reads several artifacts of a run asks this: if one of them is older than another that it was made from, the
-    two do not belong together. An artifact without a record is from another tool, and as current as can be known.
+    two do not belong together. An artifact without a record is from another tool, and as current as can be known. A
+    file of the capture that is missing has not changed: results are read where their capture is not.
     """
+    found = [(path, content, _content(path)) for path, content in sources_of(artifact).items()]
+    # A file of the capture, which alone has an absolute path in the record, may be elsewhere.
+    of_capture = _read_record(artifact).get("made_from", ())
+    return [path for path, content, now in found if now != content and (now or str(path) not in of_capture)]
+
+
+def sources_of(artifact: str | Path) -> dict[Path, Any]:
+    """Return the files that an artifact was made from, in a copied run those of the copy, with a hash of each."""
     recorded = _read_record(artifact).get("made_from")
     sources = recorded if isinstance(recorded, dict) else {}
-    paths = [(Path(os.path.normpath(Path(artifact).parent / name)), sources[name]) for name in sources]
-    return [path for path, content in paths if _content(path) != content]
+    return {Path(os.path.normpath(Path(artifact).parent / name)): content for name, content in sources.items()}
 
 
 def why_older(
-    artifact: str | Path, stage: str, suffixes: Iterable[str] = (), missing: bool = True, inputs: str | None = None
+    artifact: str | Path, stage: str, endings: Sequence[str] = (), missing: bool = True, inputs: str | None = None
 ) -> str:
     """Return a sentence that says which sources of an artifact have changed since it was made; empty if none has.
 
     Args:
         stage: the stage that makes it again.
-        suffixes: only sources with these suffixes; empty: all.
+        endings: only sources whose paths end with one of these; empty: all.
         missing: whether a source that is missing counts as changed.
         inputs: fingerprint of what is no file of its own, as the artifact's settings record it under `inputs`.
     """
     changed = [path for path in changed_sources(artifact) if missing or path.exists()]
-    changed = [path for path in changed if not suffixes or path.suffix in suffixes]
+    changed = [path for path in changed if path.as_posix().endswith(tuple(endings) or "")]
     name = Path(artifact).name
     if not changed:
         made_of = _read_record(artifact).get("settings", {}).get("inputs") or inputs
@@ -351,10 +363,10 @@ def why_older(
 
 
 def require_current(
-    artifact: str | Path, stage: str, suffixes: Iterable[str] = (), missing: bool = True, inputs: str | None = None
+    artifact: str | Path, stage: str, endings: Sequence[str] = (), missing: bool = True, inputs: str | None = None
 ) -> None:
     """Refuse an artifact whose sources have changed since it was made, see `why_older`: raise ArtifactError."""
-    if why := why_older(artifact, stage, suffixes, missing, inputs):
+    if why := why_older(artifact, stage, endings, missing, inputs):
         raise ArtifactError(f"{Path(artifact).parent}: {why}")
 
 

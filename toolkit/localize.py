@@ -46,7 +46,14 @@ from toolkit.prediction.feed_forward import FeedForwardAnswer, FeedForwardLocali
 from toolkit.prediction.hybrid import lifts
 from toolkit.prediction.network import open_predictor
 from toolkit.results.metrics import camera_messages
-from toolkit.results.pair import MAPS, attributes, query_group, session_fingerprint, update_attributes
+from toolkit.results.pair import (
+    MAPS,
+    attributes,
+    query_group,
+    session_files,
+    session_fingerprint,
+    update_attributes,
+)
 from toolkit.runs.pairs import PairRows
 from toolkit.scene.map import FEW_REFERENCES, WITHOUT_FEATURES, Map, create_methods, localize_image, needs_upright
 from toolkit.scene.run import StoredQueries
@@ -331,7 +338,8 @@ class _Pair:
             _write_poses(self.file("txt"), rows, stage.settings)
         if update_attributes(self.file("h5"), h5_attributes) or not skipped:
             files = self.file("txt"), record, [self.file("csv"), self.file("h5")]
-            write_sidecar(*files, made_from=[self.retrieval, *maps], unfinished=unfinished)
+            captured = session_files(stage.capture[f"{self.devices[0]}_map"], self.session)
+            write_sidecar(*files, made_from=[self.retrieval, *maps], captured=captured, unfinished=unfinished)
         return skipped
 
     def _made_from(self, maps: Sequence[Path]) -> dict[str, Any]:

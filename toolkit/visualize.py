@@ -91,7 +91,7 @@ def visualize_scene(
         with table.row(m, q) as row:
             table.check_upstream()
             of_pair = _poses(capture, poses_dir, m, q)
-            require_current(of_pair, "localize", (".npz",), missing=False)
+            require_current(of_pair, "localize", (".npz", ".txt"), missing=False)
             pair = LocalizedPair.open(capture, m, q, poses_dir, map_dir)
             sequences = SequencePair.find(poses_dir, capture.name, m, q)
             try:

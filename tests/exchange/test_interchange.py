@@ -529,8 +529,11 @@ def test_cameras_come_from_a_file_or_the_table(folder: Path, tmp_path: Path) -> 
     cams = report.images.set_index("image")["camera"]
     assert cams["a/2.jpg"] == cams["a/10.png"] == "SIMPLE_RADIAL, 64, 48, 40.0, 32.0, 24.0, 0.01"
     assert report.images["sensor_id"].nunique() == 2
-    with pytest.raises(CaptureError, match=r"cameras\.txt has 2 cameras"):
+    with pytest.raises(CaptureError, match=r"has 2 different cameras; .* --camera 'PINHOLE, 64, 48, 50\.0, 51"):
         import_images(folder, tmp_path / "TWO", cameras=cameras)
+    equal = tmp_path / "equal.txt"  # RealityScan writes a camera for each image
+    equal.write_text("3 PINHOLE 64 48 50 51 32 24\n8 PINHOLE 64 48 50 51 32 24\n")
+    assert import_images(folder, tmp_path / "EQUAL", cameras=equal).images["sensor_id"].nunique() == 1
     table.write_text("image,camera_id\na/2.jpg,9\n")
     with pytest.raises(CaptureError, match=r"t\.csv, line 2: camera_id '9' .*3, 8"):
         import_images(folder, tmp_path / "TWO", table=table, cameras=cameras)
@@ -666,9 +669,11 @@ def test_names_that_the_format_cannot_hold_are_left_out(folder: Path, tmp_path: 
 
 def test_tables_of_other_tools_say_how_they_are_imported(tmp_path: Path) -> None:
     PIL.Image.new("RGB", (64, 48)).save(tmp_path / "a.jpg")
-    (tmp_path / "cameras.csv").write_text("#name,x,y,alt,heading,pitch,roll,f,px,py\na.jpg,1,2,3,10,20,30,29,0,0\n")
-    with pytest.raises(CaptureError, match=r"cameras\.csv: found angles .* RealityScan .* Export as COLMAP there"):
-        import_images(tmp_path, tmp_path / "PLACE", split="map", table=tmp_path / "cameras.csv")
+    for count in ("", "#cameras 1\n"):
+        rows = "#name,x,y,alt,heading,pitch,roll,f,px,py\na.jpg,1,2,3,10,20,30,29,0,0\n"
+        (tmp_path / "cameras.csv").write_text(count + rows)
+        with pytest.raises(CaptureError, match=r"cameras\.csv: found angles .* RealityScan .* Export as COLMAP there"):
+            import_images(tmp_path, tmp_path / "PLACE", split="map", table=tmp_path / "cameras.csv")
     (tmp_path / "images.txt").write_text("# Image list with two lines of data per image:\n1 1 0 0 0 0 0 0 1 a.jpg\n\n")
     with pytest.raises(CaptureError, match=r"images\.txt: not a CSV table. Import its folder by .* import colmap"):
         import_images(tmp_path, tmp_path / "PLACE", split="map", table=tmp_path / "images.txt")

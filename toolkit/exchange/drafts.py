@@ -417,7 +417,7 @@ class Draft(Options):
         if not self.images:
             listed = f"no image is listed{f' in {self.listed_in}' if self.listed_in else ''}"
             name, status = (self.rows[0]["image"], self.rows[0]["status"]) if self.rows else ("none", listed)
-            where = " Names are paths in this folder: correct them in the list, or put the list beside the images."
+            where = " Names are paths in this folder: correct it or the list, or put the list beside the images."
             where = f" {hint[0].upper()}{hint[1:]}." if hint else where
             name = printable(name)
             why = f"First: {name}: {status.rstrip('.')}.{where if status in (NO_FILE, NOT_INSIDE) else ''}"

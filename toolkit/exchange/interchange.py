@@ -44,6 +44,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import parse_camera
 from toolkit.capture.images import (
+    camera_text,
     decode,
     default_workers,
     exif_camera,
@@ -204,6 +205,9 @@ def import_images(
         given = f"a table with the columns image, {', '.join(POSE_NAMES)}"
         raise CaptureError(f"A map needs poses: give {given}, or import a transforms.json or a COLMAP model.")
     listed_cameras = read_cameras(Path(cameras)) if cameras is not None else {}
+    if "camera_id" not in rows:  # a model often has a camera for each image, all the same
+        texts = [one if isinstance(one, str) else camera_text(one) for one in listed_cameras.values()]
+        listed_cameras = dict(zip(texts, listed_cameras.values(), strict=True))
     shared_camera = None if camera is None else camera_at("camera", camera)
     posed = rows if truth is None else _read_truth(Path(truth), rows, draft, tracks[1])
     poses = _poses_of(posed, poses_are)
@@ -365,7 +369,8 @@ def _camera_of(
             raise CaptureError(f"{where}: camera_id {row['camera_id']!r} is not in cameras.txt (it has: {ids}).")
         return by_id[row["camera_id"]], "given by cameras.txt"
     if len(by_id) > 1:
-        raise CaptureError(f"cameras.txt has {len(by_id)} cameras; give a table with the columns image, camera_id.")
+        do = f"a table with the columns image, camera_id, or one for all, such as --camera '{next(iter(by_id))}'"
+        raise CaptureError(f"cameras.txt has {len(by_id)} different cameras; give {do}.")
     if by_id:
         return next(iter(by_id.values())), "given by cameras.txt"
     return (shared, "given by --camera") if shared is not None else exif_camera(path)[:2]
@@ -436,12 +441,12 @@ def _read_table(path: Path) -> pd.DataFrame:
     if text.startswith("# kapture format"):
         raise _of_tool(path, "kapture", "kapture_export_colmap.py")
     first = next((line for line in text.splitlines() if line.strip()), "").split()
+    if re.search(r"(?m)^#name,.*heading,pitch,roll", text):
+        do = f"Export as COLMAP there, and import that by `{COMMAND} import colmap`."
+        raise CaptureError.at(path, "angles (heading, pitch, roll), as RealityScan writes them", "quaternions", do)
     of_hloc = len(first) > 4 and first[1] in pycolmap.CameraModelId.__members__
     rows = _read_hloc_list(text) if of_hloc else read_csv(path)
     columns = ("image", *POSE_NAMES, "timestamp", "camera_id", *_CAMERA_COLUMNS)
-    if {"heading", "pitch", "roll"} <= set(rows.columns):
-        do = f"Export as COLMAP there, and import that by `{COMMAND} import colmap`."
-        raise CaptureError.at(path, "angles (heading, pitch, roll), as RealityScan writes them", "quaternions", do)
     if path.name == "images.txt" and "image" not in rows:
         raise CaptureError(f"{path}: not a CSV table. Import its folder by {COMMAND} import colmap.")
     for name, count in Counter(rows.columns[:-1]).items():

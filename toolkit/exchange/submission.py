@@ -195,7 +195,7 @@ def _answers(
         run_table = PairResults.open(path, whole=False).table
         statuses = {(row.timestamp, row.device_id): row.status for row in run_table.itertuples()}
     if failed == "nearest" and np.any(rows < 0):
-        require_current(files.poses_txt(*pair), "localize", (".jsonl",), missing=False)
+        require_current(files.poses_txt(*pair), "localize", (".jsonl", ".txt"), missing=False)
         nearest, why_not = _nearest_references(files.retrieval(*pair))
     qt, answers = np.full((len(rows), 7), np.nan), list[tuple[str, str]]()
     qt[rows >= 0] = poses.qt[rows[rows >= 0]]

@@ -195,9 +195,9 @@ class PairResults:
         lengths = table.columns.intersection(["translation_error_m", "position_std_m"])
         return named_by_unit(table.assign(**table[lengths] / self.unit[1]), self.unit[0])
 
-    def require_current(self, *endings: str) -> None:
+    def require_current(self) -> None:
         """Raise ArtifactError if the poses were made from other files than those that are there now."""
-        require_current(self.path, "localize", endings, missing=False)
+        require_current(self.path, "localize", missing=False)
 
 
 def _open(h5: Path) -> h5py.File:
@@ -374,10 +374,18 @@ def read_settings(path: Path, model: type[AnySettings]) -> AnySettings:
         raise _unreadable(path, error) from None
 
 
+SESSION_FILES = "sensors.txt", "images.txt", "rigs.txt", "trajectories.txt"
+"""Files of the calibration, the images and the poses of a session; not each session has all of them."""
+
+
+def session_files(*sessions: Session) -> list[Path]:
+    """Return the existing files of `SESSION_FILES`."""
+    return [path for one in sessions for name in SESSION_FILES if (path := one.path / name).exists()]
+
+
 def session_fingerprint(session: Session) -> str:
     """Return 16 hex digits that identify the calibration, poses and image list of a session."""
-    files = ["sensors.txt", "images.txt", "rigs.txt", "trajectories.txt"]
-    return fingerprint([file_fingerprint(session.path / name) for name in files if (session.path / name).exists()])
+    return fingerprint(list(map(file_fingerprint, session_files(session))))
 
 
 def map_inputs(session: Session, features: FeatureStore) -> str:

@@ -66,6 +66,7 @@ from toolkit.prediction.network import open_predictor
 from toolkit.results.metrics import UNKNOWN_UNIT, is_posed, length_unit
 from toolkit.results.pair import (
     RETRIEVAL,
+    SESSION_FILES,
     SESSIONS_ROOT,
     Localized,
     find_query,
@@ -187,8 +188,9 @@ class Map:
                 raise ArtifactError(f"Map.open: found {value!r}, expected a run folder, a scene name and a device key.")
         files = SceneFiles(Path(run), scene)
         localized = last_localized(files, pairs := pairs_in_map(files, device))
+        of_map = [".jsonl", ".npz", *(f"/{device}_map/{name}" for name in SESSION_FILES)]
         for pair in pairs:
-            require_current(pair.with_suffix(".txt"), "localize", missing=False)
+            require_current(pair.with_suffix(".txt"), "localize", of_map, missing=False)
         reranked = Path(localized[1][RETRIEVAL]).name == files.reranked_dir.name
         return replace(cls._stored_in(device, localized, files.features, files.maps), files=files, reranked=reranked)
 

@@ -3,6 +3,7 @@
 Nothing here localizes, except `what_if` of the results.
 """
 
+import logging
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -27,6 +28,7 @@ from toolkit.files import (
     read_references,
     relative_url,
     require_current,
+    sources_of,
     why_older,
 )
 from toolkit.geometry import Ints
@@ -52,6 +54,8 @@ from toolkit.scene.query import Located, best_ranks
 
 if TYPE_CHECKING:
     from toolkit.figures.answers import Answer
+
+log = logging.getLogger(__name__)
 
 WORST = "worst"
 """Alias for the number of the worst query."""
@@ -156,7 +160,8 @@ class InspectedPair:
         files = self._files = SceneFiles(self._h5.parents[2], self._h5.parents[1].name)
         self._features_dir, self._map_dir = Path(features_dir or files.features), Path(map_dir or files.maps)
         self.settings, paths, _ = how_localized(self._h5)
-        self.retrieval = Path(paths[RETRIEVAL]) / f"{self._h5.stem}.jsonl"
+        stored = (path for path in sources_of(self._h5.with_suffix(".txt")) if path.suffix == ".jsonl")
+        self.retrieval = next(stored, Path(paths[RETRIEVAL]) / f"{self._h5.stem}.jsonl")
         capture = Capture.from_sessions_root(sessions_root or paths[SESSIONS_ROOT])
         self.localized = LocalizedPair.open(capture, map_device, query_device, poses_dir, self._map_dir)
         self.names = self.localized.localizations.names
@@ -175,6 +180,8 @@ class InspectedPair:
         names = self.localized.query_session.image_names
         images = {names[row]: number for number, rows in enumerate(self.localized.rows) for row in rows}
         number = find_query(query, images, len(self))
+        if older := why_older(self.localized.results.path, "localize", missing=False):
+            log.warning("%s", older)
         context = Located(partial(self._answer, number), partial(self._open, number))
         return self._answer(number, replace(self.localized.results[number], context=context))
 
