@@ -252,6 +252,7 @@ READERS = [
     (MAP_POSES, opened, "is of an older ios_map/trajectories.txt: run the localize stage again"),
     (TRUTH, reported, "Not shown: recall.csv is of an older proc/alignment_trajectories.txt"),
     (TRUTH, compared, "run the evaluate stage again"),
+    (TRUTH, linked_report, "its recall.csv is of an older proc/alignment_trajectories.txt"),
     (RECORD, linked_report, f"Write it again: {COMMAND} report"),
 ]
 

@@ -377,6 +377,10 @@ class Page:
         if older := why_older(path, "report"):
             found = older.partition(":")[0]
             raise ArtifactError.at(path, found, do=f"Write it again: {COMMAND} report {path.parent}.")
+        for shown in sources_of(path):
+            if older := why_older(shown, "evaluate", missing=False):
+                do = f"Run the manifest again: {COMMAND} run MANIFEST."
+                raise ArtifactError.at(path, f"its {older.partition(':')[0]}", do=do)
         return cls(path)
 
     def _repr_html_(self) -> str:
