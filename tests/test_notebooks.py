@@ -112,7 +112,7 @@ def test_a_notebook_by_hand_takes_what_the_run_has_and_writes_beside_it(
     assert (folders.map_feats_root / "marker").read_text() == "of the run"
     assert folders.out_jsonl == tmp_path / "fox-by-hand" / small_capture.name / "retrieval"
     assert made == []
-    with pytest.raises(ArtifactError, match=r"fos: no such run.*fox"):
+    with pytest.raises(ArtifactError, match=r"^run: .*fos: no such run.*fox"):
         notebook.start("retrieve", run=str(tmp_path / "fos"), map_feats_root=None, out_jsonl=None)
 
 
@@ -352,6 +352,7 @@ def test_a_wrong_parameter_is_named_as_in_its_cell(name: str) -> None:
         ("localize", {"settings": {"pnp": {"min_inliers": "x"}}}, r"^settings: pnp\.min_inliers: found 'x'"),
         ("embed", {"device": 3}, r"^device: found 3\. .* a valid list or a valid string\. Meaning: one of"),
         ("own_images", {"poses_are": "cam"}, r"^poses_are: found 'cam'\. .*Known: cam_from_world, rotation_of"),
+        ("start", {"photo": "gone.jpg"}, r"^photo: found 'gone.jpg', which does not exist\."),
         ("own_images", {"map_images": 3}, r"^map_images: found 3\. .* Meaning: folder of your map images"),
     ],
 )

@@ -301,7 +301,7 @@ def sessions_of(run: str | None, sessions_root: str | None) -> tuple[Path, Path 
         if not is_demo(found):
             from toolkit.results.pair import no_such_run  # takes half a second, for an error alone
 
-            raise no_such_run(found)
+            raise no_such_run(found, "run")
     if sessions_root is not None:
         return Path(sessions_root).expanduser().resolve(), None
     from toolkit.synthetic import render_capture
@@ -720,6 +720,8 @@ def check_values(name: str, values: Mapping[str, Any], of_run: Settings | None =
             raise _of_parameter(key, explain(error, model, path.name)) from None
         except ManifestError as error:
             raise _of_parameter(key, str(error)) from None
+    if (photo := given.get("photo")) and not Path(photo).expanduser().is_file():
+        raise ManifestError(f"photo: found {str(photo)!r}, which does not exist.")
     if name == "own_images":
         _check_own_images({key: value for key, value in given.items() if value != defaults[key]})
 

@@ -160,7 +160,15 @@ def open_run(folder: str | Path, notebook: str = "start") -> "Run":
     path = find_run(folder)
     if not (path / RECORD).is_file() and is_demo(path):
         run(find_manifest("demo", project_root()))
-    return Run.open(path)
+    return Run.open(_existing(path, "run"))
+
+
+def _existing(path: Path, parameter: str) -> Path:
+    if (path / RECORD).is_file():
+        return path
+    from toolkit.results.pair import no_such_run  # takes half a second, for an error alone
+
+    raise no_such_run(path, parameter)
 
 
 def runs_to_compare(folder: str | Path, others: Sequence[str | Path] | None = None) -> list[Path]:
@@ -171,7 +179,7 @@ def runs_to_compare(folder: str | Path, others: Sequence[str | Path] | None = No
     """
     first = open_run(folder, "compare").path
     if others is not None:
-        return [first, *map(find_run, others)]
+        return [first, *(_existing(find_run(other), "others") for other in others)]
 
     def beside() -> list[Path]:
         return sorted(record.parent for record in first.parent.glob(f"{first.name}-*/{RECORD}"))
