@@ -18,14 +18,14 @@ pytestmark = pytest.mark.browser
 def test_a_chosen_photograph_is_localized_and_shown(
     browser: "Browser", finished_run: Path, small_capture: Path, tmp_path: Path
 ) -> None:
-    cells = nbformat.read(notebook_path("start"), as_version=4).cells
-    (chooser,) = (cell for cell in cells if "choose_photograph(scene_map)" in cell.source)
+    content = nbformat.read(notebook_path("start"), as_version=4)
+    (chooser,) = (cell for cell in content.cells if "choose_photograph(scene_map)" in cell.source)
     opened = f"from toolkit.scene.run import Run\nscene_map = Run.open({str(finished_run)!r}).map('ios')"
     lines = "\n".join(line for line in chooser.source.splitlines() if line.startswith(("from ", "choose")))
-    code = [nbformat.v4.new_code_cell(source) for source in (opened, lines)]
+    content.cells = [nbformat.v4.new_code_cell(source) for source in (opened, lines)]
     folder = tmp_path / "notebooks"
     folder.mkdir()
-    nbformat.write(nbformat.v4.new_notebook(cells=code), folder / "own.ipynb")
+    nbformat.write(content, folder / "own.ipynb")
     photographs = sorted((small_capture / "sessions" / "ios_query" / "raw_data").rglob("*.jpg"))
     (torn := tmp_path / "torn.jpg").write_bytes(photographs[0].read_bytes()[:2000])
     with chromium.serve_lab(folder, tmp_path / "state", NOTEBOOKS / "lab_config.py") as url:
