@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from toolkit import notebook, pipeline
 from toolkit.__main__ import app
+from toolkit.errors import ArtifactError
 from toolkit.notebook import NOTEBOOKS
 
 WIDGET = "application/vnd.jupyter.widget-view+json"
@@ -99,3 +100,13 @@ def test_copies_take_the_runs_of_the_folder_that_lab_was_started_in(
         pipeline.open_run("runs/demo")
     assert asked == [tmp_path / "data_manifests" / "demo.yaml"]
     assert not (tmp_path / "lab" / "data_manifests").exists()
+
+
+def test_a_folder_that_is_no_run_is_named_by_the_parameter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "mine").mkdir(parents=True)
+    (tmp_path / "runs" / "mine" / "run.json").write_text("{}")
+    with pytest.raises(ArtifactError, match=r"^run: .*mind: no such run\. Did you mean 'mine'"):
+        pipeline.open_run(tmp_path / "runs" / "mind")
+    with pytest.raises(ArtifactError, match=r"^others: .*mind: no such run\. Did you mean 'mine'"):
+        pipeline.runs_to_compare(tmp_path / "runs" / "mine", [tmp_path / "runs" / "mind"])

@@ -5,6 +5,7 @@ import importlib
 import inspect
 import json
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -21,7 +22,7 @@ from toolkit import notebook, pipeline
 from toolkit.errors import ArtifactError, ManifestError, StageError
 from toolkit.manifest import OPTIONAL, STAGES, Manifest, RerankSettings, RetrieveSettings
 from toolkit.notebook import StatusLine, notebook_parameters, notebook_path
-from toolkit.runs.folder import LOG_VARIABLE
+from toolkit.runs.folder import LOG_VARIABLE, swept_runs
 
 # What the pipeline sets for a run, so that a manifest has it once and not in a section.
 OF_THE_RUN = {
@@ -111,7 +112,7 @@ def test_a_notebook_by_hand_takes_what_the_run_has_and_writes_beside_it(
     assert (folders.map_feats_root / "marker").read_text() == "of the run"
     assert folders.out_jsonl == tmp_path / "fox-by-hand" / small_capture.name / "retrieval"
     assert made == []
-    with pytest.raises(ArtifactError, match=r"fos: no such run.*fox"):
+    with pytest.raises(ArtifactError, match=r"^run: .*fos: no such run.*fox"):
         notebook.start("retrieve", run=str(tmp_path / "fos"), map_feats_root=None, out_jsonl=None)
 
 
@@ -163,7 +164,7 @@ def test_the_notebook_localizes_by_hand_as_the_run_did(small_capture: Path, tmp_
     notebook.execute(notebook_path("localize"), tmp_path / "04.ipynb", chosen)
     poses = "SMALL/poses/SMALL_map_ios_query_hl.txt"
     assert (tmp_path / "near-by-hand" / poses).read_bytes() == (tmp_path / "near" / poses).read_bytes()
-    assert "'method': 'nearest'" in (tmp_path / "04.ipynb").read_text()
+    assert re.search(r"method +nearest +run", (tmp_path / "04.ipynb").read_text())
 
 
 @pytest.mark.parametrize("stage", STAGES)
@@ -171,6 +172,7 @@ def test_every_parameter_has_a_comment(stage: str) -> None:
     lines = nbformat.read(notebook_path(stage), as_version=4).cells[1].source.splitlines()
     assert lines[0] == "# Change these first."
     assert lines.count("# The rest.") == 1
+    assert 1 <= lines.index("# The rest.") - 2 <= 8, "parameters to change first"
     assert all("  # " in line for line in lines if line and not line.startswith("# "))
 
 
@@ -181,7 +183,7 @@ def test_every_parameter_has_an_effect(stage: str) -> None:
     code = "\n".join(cell.source for cell in cells[2:] if cell.cell_type == "code")
     used = {node.id for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Name)}
     of_stage = {"settings", *type(Manifest.defaults(stage)).model_fields} if stage in STAGES else set[str]()
-    used |= {"queries"} if "folders.queries" in code else set()
+    used |= set(re.findall(r"folders\.(queries|pairs|device)\b", code))
     assert notebook_parameters(notebook_path(stage)).keys() <= used | of_stage
 
 
@@ -196,6 +198,11 @@ def test_tables_link_to_their_images(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert "href='P/sessions/hl_query/raw_data/a%20b.jpg'" in html
     assert "href='P/sessions/hl_query/raw_data/import/images/%3Cc%3E.jpg'" in html
     assert all(text in html for text in ("hl in ios", "failed: &lt;none&gt;", "&lt;c&gt;.jpg</a> gone.jpg"))
+    long = f"failed: no readable image (Image cannot be decoded (9 bytes): {tmp_path}/{'long/' * 20}torn.jpg)"
+    table = pd.DataFrame({"status": [long], "image": [f"{'long/' * 20}torn.jpg"]}, ["hl in ios"])
+    html = notebook.linked(table, tmp_path / "P/sessions").to_html()
+    assert ">failed: no readable image<" in html, "which made the column so wide that names of images were cut off"
+    assert ">…/torn.jpg<" in html
     roots = [tmp_path / "P/sessions", None]
     table = pd.DataFrame({"pair": "hl in ios", "image": ["a b.jpg", None], "sessions_root": roots})
     html = notebook.linked(table).to_html()
@@ -218,6 +225,90 @@ def test_parameters_are_of_the_run_or_settings_that_are_as_in_the_run(stage: str
     chosen = {name: value for name, value in parameters.items() if name not in OF_THE_RUN}
     assert chosen.keys() <= type(Manifest.defaults(stage)).model_fields.keys()
     assert {*chosen.values(), parameters.get("queries")} == {None}, "None: as in the run"
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_the_setup_cell_shows_the_value_of_each_parameter_that_is_as_in_the_run(
+    stage: str, small_capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are None in the cell above, so no one saw which values hold."""
+    parameters = notebook_parameters(notebook_path(stage))
+    monkeypatch.setattr(notebook, "_user_names", lambda: parameters)
+    manifest = Manifest.of({"name": "x", "captures": ["x"]})
+    folders = notebook.Folders(stage, manifest, sessions_root=small_capture / "sessions")
+    assert set(folders.values["from"]) <= {"default"}
+    names = parameters.keys() & {*type(Manifest.defaults(stage)).model_fields, "queries", "pairs", "device"}
+    assert [*folders.values.index] == [name for name in parameters if name in names]
+    assert all(f"<th>{name}</th>" in folders._repr_html_() for name in names)
+
+
+def test_values_are_from_the_notebook_the_run_or_default(small_capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names: dict[str, Any] = {"topk": 3, "settings": {"mask": {"gps": True}}, "map_device": "all", "query_device": "hl"}
+    monkeypatch.setattr(notebook, "_user_names", lambda: names)
+    of_run = {"topk": 7, "index": "HNSW32"}
+    content = {"name": "x", "captures": ["x"], "pairs": [["ios", "hl"], ["ios", "ios"]], "retrieve": of_run}
+    folders = notebook.Folders("retrieve", Manifest.of(content), Path("x"), sessions_root=small_capture / "sessions")
+    assert dict(zip(folders.values.index, folders.values.to_numpy().tolist(), strict=True)) == {
+        "topk": ["3", "notebook"], "pairs": ["[['ios', 'hl']]", "notebook"],
+        "queries": [manifest_default("queries"), "default"],
+        "index": ["HNSW32", "run"], "mask.gps": ["True", "notebook"],
+    }  # fmt: skip
+    names["topk"] = None
+    assert folders.values.loc["topk"].tolist() == ["7", "run"], "the cell has run again"
+    monkeypatch.setenv(LOG_VARIABLE, "run.log")
+    assert folders.values.loc["mask.gps", "from"] == "run", "which fills its notebooks in"
+
+
+def manifest_default(name: str) -> Any:
+    return Manifest.model_fields[name].default
+
+
+def test_devices_and_pairs_by_hand_are_those_of_the_run(small_capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All nine pairs were localized after a run of two."""
+    names: dict[str, Any] = {"map_device": "all", "query_device": "all", "pairs": None, "device": "auto"}
+    monkeypatch.setattr(notebook, "_user_names", lambda: names)
+    pairs = [["ios", "hl"], ["ios", "ios"]]
+    content = {"name": "x", "captures": ["x"], "pairs": pairs, "evaluate": {"thresholds": [[2, 0.2]]}}
+    root = small_capture / "sessions"
+    folders = notebook.Folders("retrieve", Manifest.of(content), Path("x"), sessions_root=root)
+    assert folders.pairs == pairs
+    assert folders.device == ["ios", "hl"]
+    assert folders.thresholds == [[2.0, 0.2]], "which notebook 04b took at their defaults"
+    names |= {"query_device": "hl", "device": "spot"}
+    assert (folders.pairs, folders.device) == ([["ios", "hl"]], "spot")
+    names["query_device"] = "spot"
+    assert folders.pairs is None, "a person may ask for what the run left out"
+    names["pairs"] = [["spot", "hl"]]
+    assert folders.pairs == [["spot", "hl"]]
+    everything = Manifest.of({"name": "x", "captures": ["x"]})
+    folders = notebook.Folders("embed", everything, Path("x"), sessions_root=root)
+    names |= {"pairs": None, "device": "auto"}
+    assert (folders.pairs, folders.device) == (None, "auto")
+
+
+def test_a_change_is_tried_with_all_queries_by_the_command_that_is_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "data_manifests").mkdir()
+    (tmp_path / "data_manifests" / "mine.yaml").touch()
+    (tmp_path / "lab").mkdir()
+    monkeypatch.chdir(tmp_path / "lab")
+    names: dict[str, Any] = {"run": "runs/mine"}
+    monkeypatch.setattr(notebook, "_user_names", lambda: names)
+    manifest = Manifest.of({"name": "mine", "captures": ["x"], "localize": {"matcher": "mutual"}})
+    folders = notebook.Folders("localize", manifest)
+    words = shlex.split(folders.command({"localize.matcher": "lightglue", "retrieve.topk": 3}))
+    assert words[1:3] == ["run", str(tmp_path / "data_manifests" / "mine.yaml")]
+    assert words[3:] == ["--sweep", "localize.matcher=mutual,lightglue", "--sweep", "retrieve.topk=10,3"]
+    (*_, features) = shlex.split(folders.command({"localize.features": ["sift", "aliked"]}))
+    assert swept_runs("mine", [features]) == {
+        "mine-features-auto": ["localize.features=[auto]"],
+        "mine-features-sift-aliked": ["localize.features=[sift, aliked]"],
+    }
+    names["run"] = "runs/other"
+    assert folders.command({"localize.pnp.max_error_deg": 0.1}).endswith(
+        " run MANIFEST --sweep localize.pnp.max_error_deg=0.17,0.1"
+    )
 
 
 def test_a_stage_gets_the_parameters_of_its_notebook_and_then_its_dict(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -261,6 +352,7 @@ def test_a_wrong_parameter_is_named_as_in_its_cell(name: str) -> None:
         ("localize", {"settings": {"pnp": {"min_inliers": "x"}}}, r"^settings: pnp\.min_inliers: found 'x'"),
         ("embed", {"device": 3}, r"^device: found 3\. .* a valid list or a valid string\. Meaning: one of"),
         ("own_images", {"poses_are": "cam"}, r"^poses_are: found 'cam'\. .*Known: cam_from_world, rotation_of"),
+        ("start", {"photo": "gone.jpg"}, r"^photo: found 'gone.jpg', which does not exist\."),
         ("own_images", {"map_images": 3}, r"^map_images: found 3\. .* Meaning: folder of your map images"),
     ],
 )
@@ -379,9 +471,9 @@ def test_a_table_on_a_page_has_medians_first_and_says_nothing_twice() -> None:
     row = {"map_device": "ios", "query_device": "hl", "state": "evaluated", "queries": 3, "localized": 2, "ok": 2}
     row |= {"recall@(1deg,0.1m)": 0.5, "median_rotation_deg": 0.1, "median_translation_m": 0.2, "path": "/a/b"}
     shown = notebook.readable(pd.DataFrame([row | {"reason": "", "still": "/a/b/c.png", "error_rotation_deg": 1.0}]))
-    names = ["median_deg", "median_cm", "recall@1°,0.1m [%]", "queries", "ok", "still", "error_deg"]
+    names = ["median_deg", "median_cm", "recall 1°, 0.1\N{NO-BREAK SPACE}m [%]", "queries", "ok", "still", "error_deg"]
     assert shown.columns.tolist() == names
-    assert shown.loc["hl in ios"].tolist() == ["0.10", "20", "50", 3, 2, "c.png", "1"]
+    assert shown.loc["hl\N{NO-BREAK SPACE}in\N{NO-BREAK SPACE}ios"].tolist() == ["0.10", "20", "50", 3, 2, "c.png", "1"]
     left_out = notebook.readable(pd.DataFrame([row | {"state": "left out: x", "reason": "x"}]))
     assert {"state", "reason"} <= set(left_out.columns)
     unknown = pd.DataFrame([row | {"threshold": float("nan")}, row | {"threshold": "(1deg,0.1m)"}])

@@ -119,12 +119,14 @@ def test_a_transforms_json_is_taken_as_a_table(tmp_path: Path) -> None:
 def test_poses_are_listed_with_the_names_of_images(tmp_path: Path) -> None:
     pose = make_pose(np.eye(3), [1.0, 2.0, 3.0])
     Trajectory.from_poses([1], ["import/cam_1"], pose[None]).write(tmp_path / "pair.txt")
-    rows = {"timestamp": [1, 2], "device_id": "import/cam_1", "image": ["1.jpg", "2.jpg"], "status": ["ok", "failed"]}
+    rows = {"timestamp": [1, 2], "device_id": "import/cam_1", "image": ["1.jpg", "2.jpg"]}
+    rows["status"] = ["ok", f"failed: no readable image ({tmp_path}/{'long/' * 20}2.jpg)"]
     pd.DataFrame(rows).to_csv(tmp_path / "pair.csv", index=False)
     table = list_poses(tmp_path / "pair.csv")
     assert list(table.columns) == ["image", "status", "qw", "qx", "qy", "qz", "tx", "ty", "tz"]
     assert table.iloc[0].tolist() == ["1.jpg", "ok", 1, 0, 0, 0, 1, 2, 3]
     assert table.iloc[1][["tx", "qw"]].isna().all()
+    assert table["status"][1] == "failed: no readable image", "paths pushed the poses out of the page"
 
 
 @pytest.mark.parametrize(

@@ -277,7 +277,7 @@ def test_devices_and_pairs_select_what_stages_do(place: Path) -> None:
     (spot / "images.txt").touch()
 
     def selected(*overrides: str) -> dict[str, Any]:
-        return pipeline._selection(load_manifest(place / "run.yaml", overrides), place / "P")
+        return notebook.selection(load_manifest(place / "run.yaml", overrides), place / "P")
 
     assert selected() == {}
     assert selected("devices=[spot, ios]") == {"pairs": [["ios", "ios"], ["ios", "spot"]], "device": ["ios", "spot"]}

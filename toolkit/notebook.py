@@ -9,6 +9,7 @@ import json
 import logging
 import os
 import re
+import shlex
 import shutil
 import sys
 import time
@@ -16,6 +17,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from html import escape
 from importlib import import_module
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
@@ -26,7 +28,7 @@ import tqdm.std
 from pydantic import BeforeValidator, ConfigDict, Field, NonNegativeInt, ValidationError, create_model
 
 from toolkit import errors
-from toolkit.errors import CaptureError, ManifestError, StageError, shortage
+from toolkit.errors import COMMAND, CaptureError, ManifestError, StageError, shortage
 from toolkit.files import (
     IMPORTED,
     SceneFiles,
@@ -95,7 +97,9 @@ if TEXT_BARS in os.environ:
 
 
 class Folders(SimpleNamespace):
-    """The resolved folders of a notebook, as attributes; displayed as a table, with `settings`, those of its stage."""
+    """The resolved folders of a notebook, as attributes, and the values that hold for its parameters: those of the
+    running notebook as they are now or, for None, `all` and `auto`, those of the run. Displayed as a table and a list.
+    """
 
     def __init__(self, stage: str, manifest: Manifest, finished: Path | None = None, **folders: Path | None) -> None:
         super().__init__(**folders)
@@ -112,20 +116,112 @@ class Folders(SimpleNamespace):
 
     @property
     def settings(self) -> Any:
-        """The settings model of the stage: the run's, overridden by the notebook's parameters as they are now."""
+        """The settings model of the stage."""
         section = self._manifest.stage(self._stage)
         check_values(self._stage, _user_names(), section)
         return stage_settings(self._stage, _user_names(), section)
 
     @property
+    def thresholds(self) -> Any:
+        """The run's thresholds of recall, [degrees, meters] each."""
+        return self._manifest.evaluate.thresholds
+
+    @property
     def queries(self) -> str:
-        """The name of a list of keyframes: the notebook's parameter as it is now or, if that is None, the run's."""
+        """The name of a list of keyframes."""
         return _user_names().get("queries") or self._manifest.queries
 
+    @property
+    def pairs(self) -> list[list[str]] | None:
+        """The pairs [map device, query device], of the run those with the chosen devices; None: all with these."""
+        values = _user_names()
+        chosen = [{values.get(name, "all")} - {"all"} for name in ("map_device", "query_device")]
+        of_run = [pair for pair in self._selected.get("pairs", ()) if chosen[0] <= {pair[0]} and chosen[1] <= {pair[1]}]
+        return values.get("pairs") or of_run or None
+
+    @property
+    def device(self) -> str | list[str]:
+        """The devices whose images are embedded; auto: all."""
+        given = _user_names().get("device", "auto")
+        return given if given != "auto" else self._selected.get("device", "auto")
+
+    @property
+    def _selected(self) -> dict[str, Any]:
+        return selection(self._manifest, self.sessions_root.parent) if self._finished else {}
+
+    @property
+    def values(self) -> "pd.DataFrame":
+        """The parameters, and other settings that are not at their defaults: the `value` that holds, and what it is
+        `from`, the notebook, the run or the default.
+        """
+        import pandas as pd
+
+        default, of_run = Manifest.defaults(self._stage).flat(), self._manifest.stage(self._stage).flat()
+        now = {"queries": self.queries, "pairs": self.pairs or "all", "device": self.device, **self.settings.flat()}
+        run = {"queries": self._manifest.queries, "pairs": "all", "device": "auto", **self._selected, **of_run}
+        plain = {"queries": Manifest.model_fields["queries"].default, "pairs": "all", "device": "auto", **default}
+        known = [*notebook_parameters(notebook_path(self._stage))]
+        names = [name for name in known if name in now]
+        names += [name for name in default if name not in known and now[name] != plain[name]]
+        given = "run" if LOG_VARIABLE in os.environ else "notebook"  # as a run fills its notebooks in
+        rows = [
+            (str(now[name]), given if now[name] != run[name] else "run" if now[name] != plain[name] else "default")
+            for name in names
+        ]
+        return pd.DataFrame(rows, names, ["value", "from"])
+
+    def command(self, changes: Mapping[str, Any]) -> str:
+        """Return the command that tries changes, values by keys of a manifest, with all queries of the run."""
+        file = project_root() / "data_manifests" / f"{Path(_user_names().get('run') or '').name}.yaml"
+        words = [COMMAND, "run", str(file) if file.is_file() else "MANIFEST"]
+        for key, value in changes.items():
+            section, *names = key.split(".")
+            before = self.settings if section == self._stage else getattr(self._manifest, section, None)
+            for name in names:
+                before = getattr(before, name, None)
+            words += ["--sweep", f"{key}={_of_manifest(before)},{_of_manifest(value)}"]
+        return shlex.join(words)
+
     def __repr__(self) -> str:
-        shown: dict[str, Any] = {name: path for name, path in vars(self).items() if path and not name.startswith("_")}
-        shown["settings"] = self.settings.model_dump(mode="json", exclude_defaults=True) or "defaults"
-        return "\n".join(f"{name:<{max(map(len, shown))}}  {value}" for name, value in shown.items())
+        return f"{self.values.to_string()}\n\n{self._listed()}"
+
+    def _listed(self) -> str:
+        shown = {name: path for name, path in vars(self).items() if path and not name.startswith("_")}
+        return "\n".join(f"{name:<{max(map(len, shown))}}  {path}" for name, path in shown.items())
+
+    def _repr_html_(self) -> str:
+        import pandas as pd
+
+        with pd.option_context("display.max_colwidth", None):
+            table = self.values.to_html()
+        return f"{table}<details><summary>Folders</summary><pre>{escape(self._listed())}</pre></details>"
+
+
+def _of_manifest(value: Any) -> str:
+    """Return a setting as a manifest has it, in one line."""
+    value = getattr(value, value.shorthand) if getattr(value, "shorthand", "") else value
+    return value if isinstance(value, str) else json.dumps(value, default=str)
+
+
+def selection(manifest: Manifest, capture: Path) -> dict[str, Any]:
+    """Return the parameters that select `pairs` and `devices` of a capture as the manifest does; {}: all of them."""
+    from toolkit.capture import Capture
+
+    content = Capture.open(capture)
+    present = content.devices
+    devices = present if manifest.devices == "auto" else [key for key in present if key in manifest.devices]
+    if manifest.pairs != "all":
+        pairs = [list(pair) for pair in manifest.pairs if {*pair} <= {*devices}]
+    elif manifest.devices != "auto":
+        # Without any map or query session, the stages say what is missing.
+        maps, queries = ([d for d in present if f"{d}_{split}" in content] or present for split in ("map", "query"))
+        pairs = [[m, q] for m, q in product(maps, queries) if {m, q} <= {*devices}]
+    else:
+        return {}
+    if not pairs:
+        text = f"{capture}: `devices` and `pairs` of the manifest select none of its maps with queries."
+        raise ManifestError(f"{text} Its sessions: {', '.join(content)}.")
+    return {"pairs": pairs, "device": [key for key in present if any(key in pair for pair in pairs)]}
 
 
 def start(stage: str, sessions_root: str | None = None, run: str | None = None, **folders: str | None) -> Folders:
@@ -205,7 +301,7 @@ def sessions_of(run: str | None, sessions_root: str | None) -> tuple[Path, Path 
         if not is_demo(found):
             from toolkit.results.pair import no_such_run  # takes half a second, for an error alone
 
-            raise no_such_run(found)
+            raise no_such_run(found, "run")
     if sessions_root is not None:
         return Path(sessions_root).expanduser().resolve(), None
     from toolkit.synthetic import render_capture
@@ -241,7 +337,8 @@ def readable(table: "pd.DataFrame") -> "pd.DataFrame":
     dropped = [name for name, text in trivial.items() if name in table and (table[name] == text).all()]
     shown = table.drop(columns=["path", "localized", *dropped], errors="ignore")
     if "map_device" in shown:
-        shown.index = shown.pop("query_device") + " in " + shown.pop("map_device")
+        between = "\N{NO-BREAK SPACE}in\N{NO-BREAK SPACE}"  # or narrow pages break the name of each row
+        shown.index = shown.pop("query_device") + between + shown.pop("map_device")
     for name in {"still", "recording"} & {*shown}:
         shown[name] = [Path(path).name for path in shown[name]]
     if "threshold" in shown:
@@ -275,14 +372,15 @@ def linked(table: "pd.DataFrame", sessions_root: Path | None = None) -> "Styler"
         sessions_root: `<capture>/sessions`; None: the column `sessions_root`, a folder or None for each query.
     """
     from toolkit.figures.query_images import MAX_LETTERS, shown_name
+    from toolkit.pose.base import short_status
 
     def links(pair: str, names: str, root: Path | None) -> str:
-        raw_data = (root or Path()).resolve() / f"{pair.partition(' in ')[0]}_query" / "raw_data"
+        raw_data = (root or Path()).resolve() / f"{pair.split()[0]}_query" / "raw_data"
         shown = []
         for name in filter(None, names.split(";")):
             path = next((path for path in (raw_data / name, raw_data / IMPORTED / name) if path.is_file()), None)
-            text = escape(shown_name(name, MAX_LETTERS))
-            shown.append(f"<a href='{relative_url(path)}' target='_blank'>{text}</a>" if root and path else text)
+            text, link = escape(shown_name(name, MAX_LETTERS)), f"target='_blank' title='{escape(name)}'"
+            shown.append(f"<a href='{relative_url(path)}' {link}>{text}</a>" if root and path else text)
         return " ".join(shown)
 
     table = table.drop(columns=["timestamp", "device_id"], errors="ignore")  # as the image's name tells
@@ -292,17 +390,20 @@ def linked(table: "pd.DataFrame", sessions_root: Path | None = None) -> "Styler"
     rows = zip(table["pair"], table["image"].fillna(""), roots, strict=True)
     table["image"] = [links(*row) for row in rows]
     texts = {name: _texts(table[name]) for name in table.select_dtypes(float)}
+    texts |= {name: table[name].map(short_status) for name in {"status"} & {*table}}
     shown = table.assign(**texts).style.set_properties(**{"text-align": "left"}).hide(axis="index")
     shown = shown.set_properties(subset=["pair"], **{"white-space": "nowrap"})
-    shown = shown.set_properties(subset=["image"], **{"overflow-wrap": "anywhere", "min-width": "20em"})
+    shown = shown.set_properties(subset=["image"], **{"overflow-wrap": "anywhere", "min-width": "12em"})
     shown = shown.set_table_styles([{"selector": "th", "props": "text-align: left"}])
     return shown.format(escape="html", subset=[name for name in table.columns if name != "image"])
 
 
 def _short_column(name: str) -> str:
-    """Return `median_deg` for `median_rotation_deg`, and `recall@1°,0.1m [%]` for `recall@(1deg,0.1m)`."""
+    """Return `median_deg` for `median_rotation_deg`, and `recall 1°, 0.1 m [%]` for `recall@(1deg,0.1m)`."""
+    from toolkit.results.metrics import threshold_text
+
     if name.startswith("recall@"):
-        return f"{name.replace('deg', '°').replace('(', '').replace(')', '')} [%]"
+        return f"{f'recall {threshold_text(name)}' if '(' in name else name} [%]"
     return re.sub(r"(rotation|translation)_(?=\w*(deg|m|L)$)", "", name)
 
 
@@ -479,9 +580,10 @@ def _run_stage(stage: str, sessions: Path, files: SceneFiles, run: Path | None) 
         "retrieve": [files.embeddings, files.retrieval_dir],
         "localize": [files.retrieval_dir, files.poses_dir, files.features, files.maps],
     }
-    name, options = ("embed_sessions", {}) if stage == "embed" else (f"{stage}_pairs", {"queries": manifest.queries})
+    name, known = ("embed_sessions", {"device"}) if stage == "embed" else (f"{stage}_pairs", {"queries", "pairs"})
+    values = {"queries": manifest.queries, **selection(manifest, sessions.parent)}
     run_stage = getattr(import_module(f"toolkit.{stage}"), name)
-    run_stage(sessions, *folders[stage], manifest.stage(stage), **options)
+    run_stage(sessions, *folders[stage], manifest.stage(stage), **{key: values[key] for key in known & values.keys()})
 
 
 def _user_names() -> dict[str, Any]:
@@ -618,6 +720,8 @@ def check_values(name: str, values: Mapping[str, Any], of_run: Settings | None =
             raise _of_parameter(key, explain(error, model, path.name)) from None
         except ManifestError as error:
             raise _of_parameter(key, str(error)) from None
+    if (photo := given.get("photo")) and not Path(photo).expanduser().is_file():
+        raise ManifestError(f"photo: found {str(photo)!r}, which does not exist.")
     if name == "own_images":
         _check_own_images({key: value for key, value in given.items() if value != defaults[key]})
 

@@ -70,6 +70,7 @@ from toolkit.notebook import (
     is_demo,
     notebook_parameters,
     notebook_path,
+    selection,
     work_seconds,
 )
 from toolkit.prediction.interface import ARCHITECTURES
@@ -159,7 +160,15 @@ def open_run(folder: str | Path, notebook: str = "start") -> "Run":
     path = find_run(folder)
     if not (path / RECORD).is_file() and is_demo(path):
         run(find_manifest("demo", project_root()))
-    return Run.open(path)
+    return Run.open(_existing(path, "run"))
+
+
+def _existing(path: Path, parameter: str) -> Path:
+    if (path / RECORD).is_file():
+        return path
+    from toolkit.results.pair import no_such_run  # takes half a second, for an error alone
+
+    raise no_such_run(path, parameter)
 
 
 def runs_to_compare(folder: str | Path, others: Sequence[str | Path] | None = None) -> list[Path]:
@@ -170,7 +179,7 @@ def runs_to_compare(folder: str | Path, others: Sequence[str | Path] | None = No
     """
     first = open_run(folder, "compare").path
     if others is not None:
-        return [first, *map(find_run, others)]
+        return [first, *(_existing(find_run(other), "others") for other in others)]
 
     def beside() -> list[Path]:
         return sorted(record.parent for record in first.parent.glob(f"{first.name}-*/{RECORD}"))
@@ -437,7 +446,7 @@ def _build_maps(manifest: Manifest, run_dir: Path, say: Say) -> None:
         record.write()
         for capture in captures:
             files, sessions = SceneFiles(run_dir, capture.name), capture / "sessions"
-            pairs = _selection(manifest, capture).get("pairs", ())
+            pairs = selection(manifest, capture).get("pairs", ())
             devices = list(dict.fromkeys(of_map for of_map, _ in pairs)) or Capture.open(capture).devices_with("map")
             embed_sessions(sessions, files.embeddings, embed, device=devices)
             index_maps(sessions, files.embeddings, files.retrieval_dir, retrieve, devices)
@@ -540,7 +549,7 @@ def _job(manifest: Manifest, stage: str, capture: Path, files: SceneFiles, force
         "run": str(files.run),
         "sessions_root": str(capture / "sessions"),
         "queries": manifest.queries,
-        **_selection(manifest, capture),
+        **selection(manifest, capture),
     }
     if force:
         values["skip_existing"] = False
@@ -549,27 +558,6 @@ def _job(manifest: Manifest, stage: str, capture: Path, files: SceneFiles, force
         values["settings"] = given
     known = notebook_parameters(notebook_path(stage))
     return Job(stage, files, settings, {name: value for name, value in values.items() if name in known})
-
-
-def _selection(manifest: Manifest, capture: Path) -> dict[str, Any]:
-    """Return the parameters that select `pairs` and `devices` of a capture as the manifest does; {}: all of them."""
-    from toolkit.capture import Capture
-
-    content = Capture.open(capture)
-    present = content.devices
-    devices = present if manifest.devices == "auto" else [key for key in present if key in manifest.devices]
-    if manifest.pairs != "all":
-        pairs = [list(pair) for pair in manifest.pairs if {*pair} <= {*devices}]
-    elif manifest.devices != "auto":
-        # Without any map or query session, the stages say what is missing.
-        maps, queries = ([d for d in present if f"{d}_{split}" in content] or present for split in ("map", "query"))
-        pairs = [[m, q] for m, q in product(maps, queries) if {m, q} <= {*devices}]
-    else:
-        return {}
-    if not pairs:
-        text = f"{capture}: `devices` and `pairs` of the manifest select none of its maps with queries."
-        raise ManifestError(f"{text} Its sessions: {', '.join(content)}.")
-    return {"pairs": pairs, "device": [key for key in present if any(key in pair for pair in pairs)]}
 
 
 def _inputs_of(job: Job, capture: str) -> str:

@@ -1,7 +1,6 @@
 """The visualize stage: recordings and still pictures of a scene, from the files of earlier stages."""
 
 import re
-import textwrap
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import product
@@ -21,8 +20,9 @@ from toolkit.figures.top_view import draw_scene
 from toolkit.files import pair_name, require_current, sidecar_path, write_sidecar
 from toolkit.geometry import Floats
 from toolkit.manifest import VisualizeSettings
+from toolkit.pose.base import short_status
 from toolkit.results.localized import LocalizedPair, support_of, sure_points
-from toolkit.results.metrics import is_posed, named_as_meters, worst_first
+from toolkit.results.metrics import is_posed, named_as_meters, worst_first, worst_of_each
 from toolkit.runs.pairs import PairRows, left_out
 from toolkit.viewer.queries import record_localizations
 from toolkit.viewer.sessions import record_session, session_tracks
@@ -179,7 +179,7 @@ def _draw_pair(
     order = worst_first(shown.errors).tolist()
     chosen = np.unique(np.linspace(0, len(order) - 1, min(settings.samples, len(order))).round().astype(int))
     for number, k in enumerate((order[rank] for rank in chosen), start=1):
-        title = f"{q} query in the {m} map: {shown.errors['status'].iloc[k]}"
+        title = f"{q} query in the {m} map: {short_status(shown.errors['status'].iloc[k])}"
         figure = draw_localization(details_of(k), title, shown.unit)
         save_figure(figure, out / f"localization_{pair.name}_{number}.png", figure.get_suptitle())
     tracks: dict[str, list[Floats]] = {}
@@ -203,12 +203,12 @@ def _poses(capture: Capture, poses_dir: str | Path, map_device: str, query_devic
 def _draw_worst(path: Path, scene: str, candidates: pd.DataFrame) -> None:
     """Draw the worst queries of all pairs; `candidates` are the rows of `_draw_pair`."""
     shown = []
-    for _, row in named_as_meters(candidates.iloc[worst_first(candidates)[:WORST]]).iterrows():
-        reason = [textwrap.shorten(row["status"], 72, placeholder=" …")]
+    for _, row in named_as_meters(candidates.iloc[worst_of_each(candidates, WORST)]).iterrows():
+        reason = [short_status(row["status"])]
         if row["details"].has_matches and pd.notna(row.get("num_matches")):
             reason.append(f"{row['num_matches']:.0f} matches")
         reason += filter(None, [support_of(row)])
         errors = row["rotation_error_deg"], row["translation_error_m"]
         shown.append(WorstQuery(row["pair"], ", ".join(reason), row["details"], *errors, row["unit"]))
-    title = f"{scene}: the {len(shown)} worst queries of all pairs"
+    title = f"{scene}: the {len(shown)} worst queries, each in the map in which it went worst"
     save_figure(draw_worst(shown, title), path, title)

@@ -7,7 +7,7 @@ from PIL import Image
 
 from tests.displayed import picture_of
 from toolkit.capture.upright import up_of_cameras
-from toolkit.figures.query_images import WorstQuery, draw_localization, draw_worst
+from toolkit.figures.query_images import WorstQuery, draw_localization, draw_worst, shown_name
 from toolkit.figures.style import error_colors, new_figure, save_figure
 from toolkit.figures.top_view import draw_scene
 from toolkit.geometry import make_pose, project
@@ -151,14 +151,15 @@ def test_the_worst_queries_are_drawn_with_the_matches_they_share_with_a_referenc
         WorstQuery("hl in the ios map", "ok", QueryDetails([query], [gone]), 1.0, 0.1),
         WorstQuery("hl in the ios map", "ok", QueryDetails([unmatched], [], [reference])),
     ]
-    deep = replace(query, name=f"s/raw_data/{'folder/' * 12}8.jpg")
+    deep = replace(query, name=f"s/raw_data/{'folder/' * 12}{'8' * 80}.jpg")
     worst[2] = replace(worst[2], details=QueryDetails([deep], [gone]))
     figure = draw_worst(worst, "the worst")
     first, second, third, fourth = figure.axes[:4]
     assert first.get_title(loc="left").startswith("1. hl in the ios map: failed: too few matches")
     assert second.get_title(loc="left") == "2. hl in the ios map: off by 2°, 50 cm; ok, 5 matches\n7.jpg"
     name = third.get_title(loc="left").split("\n")[1]
-    assert (len(name), name[0], name[-12:]) == (60, "…", "folder/8.jpg")
+    assert (len(name), name[0], name[-6:]) == (50, "…", "88.jpg")
+    assert shown_name(f"s/raw_data/{'folder/' * 12}8.jpg", 50) == "…/8.jpg", "what tells images apart"
     rejected, agreeing = (c.get_segments() for c in second.collections if hasattr(c, "get_segments"))
     # The reference, twice as high, is drawn at half its size beside the query.
     np.testing.assert_allclose([line[0] for line in agreeing], query.pixels[[0, 4]])

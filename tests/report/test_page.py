@@ -13,6 +13,7 @@ import pytest
 from PIL import Image, PngImagePlugin
 
 from toolkit.errors import ArtifactError
+from toolkit.figures.style import SHOWN_DPI, STORED_DPI
 from toolkit.files import SceneFiles, write_sidecar
 from toolkit.report import page as report
 from toolkit.report.page import write_report
@@ -244,6 +245,11 @@ def test_unreadable_tables_are_named_and_the_rest_is_shown(full):
 def test_without_ground_truth_the_least_supported_are_listed(full):
     for path in full.rglob("evaluation/*.csv"):
         path.unlink()
+    assert "The 2 least supported; there is no ground truth" in text_of(write_report(full).read_text()), "of both maps"
+    for number, path in enumerate(sorted(full.rglob("poses/*.csv"))):
+        table = pd.read_csv(path)
+        if "status" in table:
+            table.assign(timestamp=range(10 * number, 10 * number + len(table))).to_csv(path, index=False)
     text = text_of(write_report(full).read_text())
     assert "The 4 least supported; there is no ground truth" in text
     assert text.index("failed: too few inliers (3") < text.index("low confidence 30")
@@ -267,6 +273,11 @@ def test_scene_without_ground_truth(tmp_path):
     for name in ("losses", "errors", "retrieval"):
         table.iloc[:0].to_csv(files.evaluation / f"{name}.csv", index=False)
     assert "ios hl no ground truth" in text_of(write_report(files.run).read_text())
+
+
+def test_letters_are_as_large_in_all_pictures(full):
+    """A small figure was stretched to the width of the page."""
+    assert f'width="{round(200 * SHOWN_DPI / STORED_DPI)}" alt="Error curves"' in write_report(full).read_text()
 
 
 def test_unreadable_picture_is_named(full):

@@ -3,7 +3,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 
-from toolkit.results.metrics import camera_messages, parse_threshold, threshold_name, worst_first
+from toolkit.results.metrics import camera_messages, parse_threshold, threshold_name, worst_first, worst_of_each
 
 
 def test_without_truth_failed_and_weak_queries_come_first():
@@ -70,3 +70,14 @@ def test_a_camera_that_does_not_fit_most_of_its_queries_is_named_once():
     for focals_px in ([np.nan] * 4, [np.nan, "450.0", "", "361.0;"], [np.nan, 450.0, 450.0, np.nan]):
         other = pd.DataFrame({"status": [contradicted, "ok", "ok", "ok"], "focal_px": focals_px})
         assert camera_messages(session, [other]) == []  # type: ignore[arg-type]
+
+
+def test_the_worst_are_different_queries() -> None:
+    """A torn image was three of the ten worst of a run with three maps."""
+    queries = pd.DataFrame({
+        "map_device": ["a", "b", "a", "b"], "query_device": "q", "device_id": "c", "timestamp": [1, 1, 2, 2],
+        "status": ["ok", "failed", "ok", "ok"], "rotation_error_deg": [0.0, np.inf, 1.0, 3.0],
+        "translation_error_m": [0.0, np.inf, 0.0, 0.0],
+    })  # fmt: skip
+    assert worst_of_each(queries, 10).tolist() == [1, 3]
+    assert worst_of_each(queries, 1).tolist() == [1]

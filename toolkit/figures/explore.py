@@ -18,7 +18,7 @@ from toolkit.figures.style import GREEN, ORANGE, VERMILLION, new_figure, plain_l
 from toolkit.figures.top_view import Ground, Layer, draw_places
 from toolkit.files import image_name, pair_devices, read_references
 from toolkit.geometry import Floats, qt_from_pose, unit
-from toolkit.pose.base import statuses
+from toolkit.pose.base import short_status, statuses
 from toolkit.results.metrics import is_posed
 from toolkit.results.pair import PairResults
 from toolkit.sequences.odometry import Odometry, recordings_of
@@ -71,12 +71,13 @@ def _odometry(session: Session) -> str:
 
 
 def list_poses(path: str | Path) -> pd.DataFrame:
-    """Return image, status and world_from_device of the queries in a pair's `.csv`; NaN without a pose."""
+    """Return image, status, shortened, and world_from_device of the queries in a pair's `.csv`; NaN without a pose."""
     results = PairResults.open(path)
     table, poses = results.table, results.poses
     rows = np.full((len(table), len(POSE_NAMES)), np.nan)
     rows[is_posed(poses)] = qt_from_pose(poses[is_posed(poses)])
-    return table.reindex(columns=["image", "status"]).join(pd.DataFrame(rows, columns=POSE_NAMES))
+    shown = table.reindex(columns=["image"]).assign(status=table["status"].map(short_status))
+    return shown.join(pd.DataFrame(rows, columns=POSE_NAMES))
 
 
 def list_unsure(paths: Iterable[str | Path]) -> pd.DataFrame:

@@ -30,13 +30,16 @@ MAX_LINES = 60
 """Lines drawn for correspondences that agree, and for rejected ones: more would hide the images."""
 MAX_SHOWN = 8
 """References of an image that `draw_query_and_references` draws."""
-MAX_LETTERS = 60
-"""Letters of an image name on the sheet of the worst queries: more would run into the next image."""
+MAX_LETTERS = 50
+"""Letters of an image name in a table, or on the sheet of the worst queries: more would run into the next image."""
 
 
 def shown_name(name: str, most: int = 1000) -> str:
-    """Return an image's name as the user knows it: without its session, and at most its last `most` letters."""
+    """Return an image's name as the user knows it: without its session; of a name longer than `most` letters, that of
+    the file, and of that the end.
+    """
     name = own_name(name.rpartition("/raw_data/")[2])
+    name = name if len(name) <= most else f"…/{name.rpartition('/')[2]}"
     return name if len(name) <= most else f"…{name[1 - most :]}"
 
 

@@ -176,6 +176,15 @@ class Settings(BaseModel):
         """Return the explicitly set fields as plain values; fields left at their defaults are absent."""
         return self.model_dump(mode="json", exclude_unset=True)
 
+    def flat(self) -> dict[str, Any]:
+        """Return all values by their keys, such as `pnp.min_inliers`; a section's shorthand has the section's key."""
+        rows: dict[str, Any] = {}
+        for name, value in self:
+            nested = value.flat() if isinstance(value, Settings) else {"": value}
+            short = getattr(value, "shorthand", "")
+            rows |= {name if key in ("", short) else f"{name}.{key}": inner for key, inner in nested.items()}
+        return rows
+
 
 def expand(model: type[Settings], raw: Mapping[str, Any]) -> dict[str, Any]:
     """Return the raw values of a model with every shorthand written out, ready to be merged key by key."""

@@ -2,6 +2,8 @@
 references, and correspondences.
 """
 
+import re
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -52,6 +54,8 @@ SEARCH_DEG = (1.0, 6.0)
 NEARBY_M = 3.0
 """Assumed depth of the scene, in map lengths (see `Survey.length`), to turn the uncertainty of a position into an
 angle."""
+MAX_STATUS = 70
+"""Letters of a status that tables and titles show; the tables of the poses have all of it."""
 NetworkMatches = Callable[[str], PairMatches]
 """Returns the stored network matches between a query image and the map image of a given name."""
 
@@ -78,6 +82,12 @@ class Status(StrEnum):
 def statuses(texts: pd.Series) -> pd.Series:
     """Return the column `status` of a table without the reasons: `ok`, `low_confidence`, `failed`."""
     return texts.astype(object).fillna("").astype(str).str.split(":", n=1).str[0]
+
+
+def short_status(text: str) -> str:
+    """Return a status for a table or title: the details in parentheses, such as paths, are left out if it is long."""
+    text = text if len(text) <= MAX_STATUS else re.sub(r" \(.*", "", text, flags=re.S)
+    return textwrap.shorten(text, MAX_STATUS, placeholder=" …")
 
 
 def status_counts(texts: pd.Series) -> dict[str, int]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from toolkit.capture import Capture
 from toolkit.capture.names import allow_outside, extra_devices
 from toolkit.errors import COMMAND, ArtifactError, ToolkitError
-from toolkit.figures.query_images import draw_localization
+from toolkit.figures.query_images import MAX_LETTERS, draw_localization, shown_name
 from toolkit.figures.style import BLUE, GREEN, ORANGE, SKY, VERMILLION, new_figure, number, percent, styled
 from toolkit.files import SceneFiles, require_current, require_whole
 from toolkit.geometry import Floats, Ints
@@ -34,8 +34,8 @@ INTERVAL = (2.5, 97.5)
 """Percentiles of the resamples that bound an interval."""
 ALL = "all"
 """Value of the scene and device columns in rows that sum over all pairs."""
-MAX_ROWS, MAX_LETTERS = 20, 32
-"""Queries won or lost that are listed; letters of an image name beyond which only the file name is shown."""
+MAX_ROWS = 20
+"""Queries won or lost that are listed."""
 QUERY = ["scene", "map_device", "query_device", "timestamp", "device_id"]
 _PAIR = QUERY[:3]
 _ERRORS = ["rotation_error_deg", "translation_error_m"]
@@ -392,7 +392,7 @@ def draw_changes(comparison: Comparison, most: int) -> "Iterator[tuple[str, list
         lost_rows = _spread(lost, max(most // 2, most - len(won)))
         for row in [*lost_rows, *_spread(won, most - len(lost_rows))]:
             change = table.loc[row].to_dict()
-            query = f"{change['query_device']} query {_name(change)}"
+            query = f"{change['query_device']} query {shown_name(str(change['image']), MAX_LETTERS)}"
             outcome = f"{change['change']} by {run} at {_limits(comparison, change['at'])}"
             try:
                 drawn = [_draw_query(comparison, change, name) for name in (first, run)]
@@ -418,12 +418,6 @@ def _draw_query(comparison: Comparison, query: Mapping[str, Any], run: str) -> "
         figure = draw_localization(pair.details(int(rows[0])), title=title, unit=pair.results.unit)
         figure.set_label(f"query {query['timestamp']}, {title}")
         return title, figure
-
-
-def _name(change: Mapping[str, Any]) -> str:
-    """Return the image name of a query; only the file name if it is long."""
-    name = str(change["image"])
-    return name if len(name) <= MAX_LETTERS else f"…/{name.rpartition('/')[2]}"
 
 
 def _spread(rows: Sequence[int], most: int) -> list[int]:

@@ -18,7 +18,8 @@ from markupsafe import Markup, escape
 from toolkit.capture.tables import POSES_UNIT
 from toolkit.errors import ArtifactError
 from toolkit.figures.evaluation import CHANGES
-from toolkit.figures.style import as_jpeg, number, percent
+from toolkit.figures.query_images import MAX_LETTERS, shown_name
+from toolkit.figures.style import SHOWN_DPI, STORED_DPI, as_jpeg, number, percent
 from toolkit.files import (
     SceneFiles,
     of_sequence,
@@ -29,7 +30,7 @@ from toolkit.files import (
     write_sidecar,
     write_text,
 )
-from toolkit.pose.base import Status, status_counts, statuses
+from toolkit.pose.base import Status, short_status, status_counts, statuses
 from toolkit.report import review
 from toolkit.report.review import Interval
 from toolkit.results import metrics
@@ -46,8 +47,6 @@ WORST, MAX_REASONS = 10, 12
 """Rows listed for a scene: the worst queries, and the reasons why queries have no pose."""
 OK_WRONG = "ok but wrong"
 CAPTION = "Every pair: recall with its 95 % interval, median errors, and time per query"
-MAX_STATUS = 70
-"""Letters of a status that are shown; the tables of the poses have all of it."""
 LONG = 30
 """Letters from which the text of a table is wrapped."""
 LINKED = {
@@ -95,6 +94,8 @@ class Picture:
     caption: str
     path: str
     """Relative to the run folder."""
+    width: int = 0
+    """Width that it is shown with, pixels, so that letters are as large in all pictures."""
 
 
 def write_report(run_dir: str | Path) -> Path:
@@ -515,13 +516,14 @@ def _worst(queries: pd.DataFrame, thresholds: list[str]) -> Markup:
         return Markup()
     threshold = metrics.parse_threshold(thresholds[0]) if thresholds else metrics.THRESHOLDS[0]
     unit = metrics.unit_of(*thresholds)
-    worst = queries.iloc[metrics.worst_first(queries, threshold)[:WORST]]
+    worst = queries.iloc[metrics.worst_of_each(queries, WORST, threshold)]
     many = f"{len(worst)} " if len(worst) > 1 else ""
+    where = ", each in the map in which it went worst" if queries["map_device"].nunique() > 1 else ""
     caption = f"The {many}least supported; there is no ground truth to compare with"
     if "rotation_error_deg" in queries:
         caption = f"The {many}worst, by the larger of rotation error / {threshold[0]:g}° and "
         caption += f"translation error / {threshold[1]:g} {unit}"
-    return _listed(worst, caption, unit)
+    return _listed(worst, caption + where, unit)
 
 
 def _listed(queries: pd.DataFrame, caption: str, unit: str) -> Markup:
@@ -531,15 +533,14 @@ def _listed(queries: pd.DataFrame, caption: str, unit: str) -> Markup:
         rows, names = queries.to_dict("records"), {}
         table["off by"] = [off_by(row, unit=unit) for row in rows]
         table["why"] = [_why(row) for row in rows]
-    status = queries["status"].str.replace("low_confidence", "low confidence")
-    table["status"] = status.where(status.str.len() <= MAX_STATUS, status.str[:MAX_STATUS] + " …")
+    table["status"] = queries["status"].map(short_status).str.replace("low_confidence", "low confidence")
     table["inliers"] = queries["num_inliers"]
     names |= {"p_correct": "stated to be right", "rival_support": "support of a rival"}
     known = queries.filter([*names]).dropna(axis="columns", how="all").rename(columns=names)
     formats: dict[str, Write] = dict.fromkeys(["stated to be right", "support of a rival"], _share)
-    images = queries["image"].fillna("").str.split(";")
-    shown = [first + (f" and {len(more)} more" if more else "") for first, *more in images]
-    return _table(table.join(known).assign(image=shown), caption, formats)
+    listed = queries["image"].fillna("").str.split(";")
+    images = [shown_name(first, MAX_LETTERS) + (f" and {len(more)} more" if more else "") for first, *more in listed]
+    return _table(table.join(known).assign(image=images), caption, formats)
 
 
 def _queries(table: pd.DataFrame) -> "pd.Series[str]":
@@ -640,6 +641,7 @@ class Album:
         try:
             with Image.open(path) as image:
                 info = getattr(image, "text", {})
+                width = round(image.width * SHOWN_DPI / STORED_DPI)
                 title = title or info.get("Title") or info.get("Description") or path.stem.replace("_", " ")
                 data, kind = path.read_bytes(), "png"
                 if image.width > MAX_WIDTH or len(data) > 150_000:
@@ -652,4 +654,4 @@ class Album:
             self.left_out.append(name)
             return Picture("", title, caption, link)
         self.room -= len(data)
-        return Picture(f"data:image/{kind};base64,{base64.b64encode(data).decode()}", title, caption, link)
+        return Picture(f"data:image/{kind};base64,{base64.b64encode(data).decode()}", title, caption, link, width)

@@ -170,6 +170,13 @@ def worst_first(queries: pd.DataFrame, threshold: Threshold = THRESHOLDS[0]) -> 
     return np.lexsort((-column("position_std_m", np.inf), column("num_inliers", 0), sure, -error, ok))
 
 
+def worst_of_each(queries: pd.DataFrame, most: int, threshold: Threshold = THRESHOLDS[0]) -> Ints:
+    """Return what `worst_first` does, at most `most` rows, each query only in the map in which it went worst."""
+    order = worst_first(queries, threshold)
+    keys = queries.iloc[order].reindex(columns=["query_device", "device_id", "timestamp"])
+    return order[~keys.duplicated().to_numpy(bool)][:most]
+
+
 def summary_of(
     rotation_deg: Floats, translation: Floats, thresholds: Sequence[Threshold], unit: str
 ) -> dict[str, float]:

@@ -286,10 +286,10 @@ def find_query(query: object, images: Mapping[str, int], count: int, what: str =
 # Runs, and how they localized
 
 
-def no_such_run(run: Path) -> ArtifactError:
-    """Return an error that lists the runs beside a folder that is none."""
+def no_such_run(run: Path, parameter: str = "") -> ArtifactError:
+    """Return an error that lists the runs beside a folder that is none, the value of a notebook's parameter or not."""
     known = [path.parent.name for path in run.parent.glob(f"*/{RECORD}")]
-    return ArtifactError(f"{run}: no such run. {nearest(run.name, known)}")
+    return ArtifactError(f"{f'{parameter}: ' if parameter else ''}{run}: no such run. {nearest(run.name, known)}")
 
 
 def localized_scenes(run: Path) -> list[str]:
