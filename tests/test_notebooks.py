@@ -259,6 +259,16 @@ def test_values_are_from_the_notebook_the_run_or_default(small_capture: Path, mo
     assert folders.values.loc["mask.gps", "from"] == "run", "which fills its notebooks in"
 
 
+def test_a_section_that_is_null_is_one_value(small_capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = dict[str, Any]()
+    monkeypatch.setattr(notebook, "_user_names", lambda: names)
+    for of_run, given, source in (({"map": None}, {}, "run"), ({}, {"map": None}, "notebook")):
+        names["settings"] = given
+        manifest = Manifest.of({"name": "x", "captures": ["x"], "localize": of_run})
+        folders = notebook.Folders("localize", manifest, Path("x"), sessions_root=small_capture / "sessions")
+        assert folders.values.loc["map"].tolist() == ["None", source]
+
+
 def manifest_default(name: str) -> Any:
     return Manifest.model_fields[name].default
 

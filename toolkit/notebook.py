@@ -157,17 +157,17 @@ class Folders(SimpleNamespace):
         import pandas as pd
 
         default, of_run = Manifest.defaults(self._stage).flat(), self._manifest.stage(self._stage).flat()
-        now = {"queries": self.queries, "pairs": self.pairs or "all", "device": self.device, **self.settings.flat()}
+        settings = self.settings.flat()
+        now = {"queries": self.queries, "pairs": self.pairs or "all", "device": self.device, **settings}
         run = {"queries": self._manifest.queries, "pairs": "all", "device": "auto", **self._selected, **of_run}
         plain = {"queries": Manifest.model_fields["queries"].default, "pairs": "all", "device": "auto", **default}
         known = [*notebook_parameters(notebook_path(self._stage))]
         names = [name for name in known if name in now]
-        names += [name for name in default if name not in known and now[name] != plain[name]]
+        absent = object()  # a section that is null is one value, else several
+        names += [name for name in settings if name not in known and now[name] != plain.get(name, absent)]
         given = "run" if LOG_VARIABLE in os.environ else "notebook"  # as a run fills its notebooks in
-        rows = [
-            (str(now[name]), given if now[name] != run[name] else "run" if now[name] != plain[name] else "default")
-            for name in names
-        ]
+        at = [(now[name], run.get(name, absent), plain.get(name, absent)) for name in names]
+        rows = [(str(a), given if a != b else "run" if a != c else "default") for a, b, c in at]
         return pd.DataFrame(rows, names, ["value", "from"])
 
     def command(self, changes: Mapping[str, Any]) -> str:
