@@ -325,17 +325,22 @@ def changed_sources(artifact: str | Path) -> list[Path]:
     two do not belong together. An artifact without a record is from another tool, and as current as can be known. A
     file of the capture that is missing has not changed: results are read where their capture is not.
     """
-    found = [(path, content, _content(path)) for path, content in sources_of(artifact).items()]
     # A file of the capture, which alone has an absolute path in the record, may be elsewhere.
-    of_capture = _read_record(artifact).get("made_from", ())
-    return [path for path, content, now in found if now != content and (now or str(path) not in of_capture)]
+    found = [(name, path, content, _content(path)) for name, path, content in _sources(artifact)]
+    return [path for name, path, content, now in found if now != content and (now or not Path(name).is_absolute())]
 
 
 def sources_of(artifact: str | Path) -> dict[Path, Any]:
     """Return the files that an artifact was made from, in a copied run those of the copy, with a hash of each."""
+    return {path: content for _, path, content in _sources(artifact)}
+
+
+def _sources(artifact: str | Path) -> list[tuple[str, Path, Any]]:
+    """Return name in the record, path and hash of the files that an artifact was made from."""
     recorded = _read_record(artifact).get("made_from")
     sources = recorded if isinstance(recorded, dict) else {}
-    return {Path(os.path.normpath(Path(artifact).parent / name)): content for name, content in sources.items()}
+    folder = Path(artifact).parent
+    return [(name, Path(os.path.normpath(folder / name)), content) for name, content in sources.items()]
 
 
 def why_older(
