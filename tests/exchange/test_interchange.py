@@ -669,9 +669,9 @@ def test_names_that_the_format_cannot_hold_are_left_out(folder: Path, tmp_path: 
 
 def test_tables_of_other_tools_say_how_they_are_imported(tmp_path: Path) -> None:
     PIL.Image.new("RGB", (64, 48)).save(tmp_path / "a.jpg")
-    for count in ("", "#cameras 1\n"):
-        rows = "#name,x,y,alt,heading,pitch,roll,f,px,py\na.jpg,1,2,3,10,20,30,29,0,0\n"
-        (tmp_path / "cameras.csv").write_text(count + rows)
+    names = "name,x,y,alt,heading,pitch,roll,f,px,py\n"
+    for header in (f"#{names}", f"#cameras 1\n#{names}", names, names.replace("heading,pitch", "pitch,heading")):
+        (tmp_path / "cameras.csv").write_text(f"{header}a.jpg,1,2,3,10,20,30,29,0,0\n")
         with pytest.raises(CaptureError, match=r"cameras\.csv: found angles .* RealityScan .* Export as COLMAP there"):
             import_images(tmp_path, tmp_path / "PLACE", split="map", table=tmp_path / "cameras.csv")
     (tmp_path / "images.txt").write_text("# Image list with two lines of data per image:\n1 1 0 0 0 0 0 0 1 a.jpg\n\n")

@@ -441,7 +441,8 @@ def _read_table(path: Path) -> pd.DataFrame:
     if text.startswith("# kapture format"):
         raise _of_tool(path, "kapture", "kapture_export_colmap.py")
     first = next((line for line in text.splitlines() if line.strip()), "").split()
-    if re.search(r"(?m)^#name,.*heading,pitch,roll", text):
+    # The header may follow a line with the number of cameras.
+    if any({"heading", "pitch", "roll"} <= {*re.split(r"[\s,;]+", line)} for line in text.splitlines()[:2]):
         do = f"Export as COLMAP there, and import that by `{COMMAND} import colmap`."
         raise CaptureError.at(path, "angles (heading, pitch, roll), as RealityScan writes them", "quaternions", do)
     of_hloc = len(first) > 4 and first[1] in pycolmap.CameraModelId.__members__
