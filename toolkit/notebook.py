@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from functools import cached_property
 from html import escape
 from importlib import import_module
 from itertools import product
@@ -145,7 +146,7 @@ class Folders(SimpleNamespace):
         given = _user_names().get("device", "auto")
         return given if given != "auto" else self._selected.get("device", "auto")
 
-    @property
+    @cached_property
     def _selected(self) -> dict[str, Any]:
         return selection(self._manifest, self.sessions_root.parent) if self._finished else {}
 
