@@ -375,6 +375,8 @@ def _jobs(
 
 
 def _run_stages(manifest: Manifest, stages: list[str], run_dir: Path, force: bool, say: Say, kernels: Kernels) -> None:
+    if manifest.demo_data is not None and not _demo_folder(manifest).exists():
+        kernels.prepare()  # while the capture is rendered
     jobs, record = _jobs(manifest, _captures(manifest), stages, run_dir, force)
     for job in jobs:
         # Weights first, because `_reusable` reads all output files of the job.
@@ -538,8 +540,11 @@ def _captures(manifest: Manifest) -> list[Path]:
         return [Path(capture) for capture in manifest.captures]
     from toolkit.synthetic import render_capture
 
-    folder = Path(manifest.output_root).parent / "data" / manifest.name
-    return [render_capture(folder, **manifest.demo_data.model_dump())]
+    return [render_capture(_demo_folder(manifest), **manifest.demo_data.model_dump())]
+
+
+def _demo_folder(manifest: Manifest) -> Path:
+    return Path(manifest.output_root).parent / "data" / manifest.name
 
 
 def _job(manifest: Manifest, stage: str, capture: Path, files: SceneFiles, force: bool) -> Job:

@@ -1,11 +1,12 @@
 """The visualize stage: recordings and still pictures of a scene, from the files of earlier stages."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -15,7 +16,7 @@ from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, DamagedError
 from toolkit.figures.evaluation import SequencePair, draw_sequence, warn_of_older
 from toolkit.figures.query_images import WorstQuery, draw_localization, draw_worst
-from toolkit.figures.style import save_figure
+from toolkit.figures.style import rendered, save_figure, save_picture
 from toolkit.figures.top_view import draw_scene
 from toolkit.files import pair_name, require_current, sidecar_path, write_sidecar
 from toolkit.geometry import Floats
@@ -26,6 +27,9 @@ from toolkit.results.metrics import is_posed, named_as_meters, worst_first, wors
 from toolkit.runs.pairs import PairRows, left_out
 from toolkit.viewer.queries import record_localizations
 from toolkit.viewer.sessions import record_session, session_tracks
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 WORST = 10
 """Queries on the sheet of the worst queries of all pairs."""
@@ -167,30 +171,35 @@ def _draw_pair(
     m, q = pair.map_session.device, pair.query_session.device
     shown, cloud, map_poses = pair.localizations, sure_points(pair.local_map), pair.map_session.world_from_cam()
     details_of = lru_cache(2 * WORST)(pair.details)  # the worst queries are needed for the sheet and the recording
-    figure = draw_scene(
-        *(*cloud, map_poses, shown.estimated, shown.true),
-        up=settings.world_up,
-        title=f"{q} queries in the {m} map, seen from above",
-        map_tracks=session_tracks(pair.map_session),
-        query_tracks=session_tracks(pair.query_session),
-        unit=shown.unit,
-    )
-    save_figure(figure, out / f"{pair.name}.png", figure.get_suptitle())
-    order = worst_first(shown.errors).tolist()
-    chosen = np.unique(np.linspace(0, len(order) - 1, min(settings.samples, len(order))).round().astype(int))
-    for number, k in enumerate((order[rank] for rank in chosen), start=1):
-        title = f"{q} query in the {m} map: {short_status(shown.errors['status'].iloc[k])}"
-        figure = draw_localization(details_of(k), title, shown.unit)
-        save_figure(figure, out / f"localization_{pair.name}_{number}.png", figure.get_suptitle())
-    tracks: dict[str, list[Floats]] = {}
+    order, tracks = worst_first(shown.errors).tolist(), dict[str, list[Floats]]()
     if sequences is not None:
-        figure = draw_sequence(capture, sequences, m, q, settings.world_up, shown.unit)
-        save_figure(figure, out / f"{pair.name}_sequence.png")
         tracks = {"odometry": sequences.odometry_tracks(pair.query_session), "frames": sequences.tracks()}
-    if settings.recordings:
-        details = ((k, details_of(k)) for k in sorted(order[: settings.matched_queries]))
-        where = (out / f"{pair.name}.rrd", pair.name, map_poses, *cloud)
-        record_localizations(*where, shown, details, up=settings.world_up, tracks=tracks)
+
+    def figures() -> "Iterator[tuple[Figure, Path]]":
+        yield draw_scene(
+            *(*cloud, map_poses, shown.estimated, shown.true),
+            up=settings.world_up,
+            title=f"{q} queries in the {m} map, seen from above",
+            map_tracks=session_tracks(pair.map_session),
+            query_tracks=session_tracks(pair.query_session),
+            unit=shown.unit,
+        ), out / f"{pair.name}.png"  # fmt: skip
+        chosen = np.unique(np.linspace(0, len(order) - 1, min(settings.samples, len(order))).round().astype(int))
+        for number, k in enumerate((order[rank] for rank in chosen), start=1):
+            title = f"{q} query in the {m} map: {short_status(shown.errors['status'].iloc[k])}"
+            yield draw_localization(details_of(k), title, shown.unit), out / f"localization_{pair.name}_{number}.png"
+        if sequences is not None:
+            sequence = draw_sequence(capture, sequences, m, q, settings.world_up, shown.unit)
+            yield sequence, out / f"{pair.name}_sequence.png"
+
+    with ThreadPoolExecutor(1) as encoder:  # encodes pictures while others are drawn and recorded
+        saved = [encoder.submit(save_picture, rendered(one), path, one.get_suptitle()) for one, path in figures()]
+        if settings.recordings:
+            details = ((k, details_of(k)) for k in sorted(order[: settings.matched_queries]))
+            where = (out / f"{pair.name}.rrd", pair.name, map_poses, *cloud)
+            record_localizations(*where, shown, details, up=settings.world_up, tracks=tracks)
+        for picture in saved:
+            picture.result()
     worst = order[:WORST]
     more = {"unit": shown.unit[0], "pair": f"{q} in the {m} map", "details": [details_of(k) for k in worst]}
     return shown.errors.iloc[worst].assign(**more)

@@ -70,11 +70,8 @@ def picture_of(figure: "Figure") -> bytes:
 
     So photographs become JPEG; lines and text stay PNG, which is sharper and no larger.
     """
-    from PIL import Image
-
-    png = _png_of(figure)
-    with Image.open(io.BytesIO(png)) as picture:
-        small = as_jpeg(picture, picture.width)
+    picture = rendered(figure)
+    png, small = _as_png(picture), as_jpeg(picture, picture.width)
     return small if 2 * len(small) < len(png) else png
 
 
@@ -133,27 +130,42 @@ def shared_legend(figure: "Figure | SubFigure", axes: Iterable["Axes"], **style:
 
 def save_figure(figure: "Figure", path: str | Path, caption: str = "") -> Path:
     """Write a figure as PNG and return the path; the caption is stored in the file for the report."""
+    return save_picture(rendered(figure), path, caption)
+
+
+def save_picture(picture: "Image", path: str | Path, caption: str = "") -> Path:
+    """Write a rendered figure as `save_figure` does; in another thread, it takes no time of that which draws."""
     with write_atomic(path) as temporary:
-        temporary.write_bytes(_png_of(figure, caption))
+        temporary.write_bytes(_as_png(picture, caption))
     return Path(path)
 
 
 @styled
-def _png_of(figure: "Figure", caption: str = "") -> bytes:
+def rendered(figure: "Figure") -> "Image":
+    """Return the pixels of a figure, RGB, as it is stored: with the style's resolution and border."""
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from PIL import Image
 
     # Compute layout and border here: `savefig` would draw the whole figure once more for that.
     figure.dpi = mpl.rcParams["savefig.dpi"]
-    renderer, engine = FigureCanvasAgg(figure).get_renderer(), figure.get_layout_engine()
+    canvas, engine = FigureCanvasAgg(figure), figure.get_layout_engine()
+    renderer = canvas.get_renderer()
     if engine is not None:
         engine.execute(figure)
         figure.set_layout_engine(None)
     border = figure.get_tightbbox(renderer).padded(mpl.rcParams["savefig.pad_inches"])
-    # No `Software`, which names the version of matplotlib: equal data should give equal bytes.
-    metadata, stream = {"Software": None, "Description": caption}, io.BytesIO()
+    figure.savefig(io.BytesIO(), format="raw", bbox_inches=border)
+    return Image.fromarray(np.asarray(canvas.renderer.buffer_rgba())).convert("RGB")
+
+
+def _as_png(picture: "Image", caption: str = "") -> bytes:
+    from PIL.PngImagePlugin import PngInfo
+
+    stream, text = io.BytesIO(), PngInfo()
+    text.add_text("Description", caption)
     # Stronger compression takes three times as long and saves nothing on figures.
-    figure.savefig(stream, bbox_inches=border, metadata=metadata, pil_kwargs={"compress_level": 1})
+    picture.save(stream, "PNG", pnginfo=text, compress_level=1)
     return stream.getvalue()
 
 
@@ -193,7 +205,7 @@ def draw_error_legend(unit: str = "m") -> bytes:
     """Return the legend of the error colors as PNG; `unit`: unit of the errors."""
     figure = new_figure(1.3, 2.4)
     error_bar(figure, unit, cax=figure.subplots())
-    return _png_of(figure)
+    return _as_png(rendered(figure))
 
 
 def percent(share: float) -> str:

@@ -20,7 +20,9 @@ _ARGUMENTS = [
     # Slow imports run early, while the previous notebook still runs. The garbage collector ignores what they leave: it
     # would search these 200,000 objects again and again (15 % of the imports' time, 5 % of that of drawing).
     "--IPKernelApp.exec_lines=import gc; gc.disable(); __import__('toolkit.notebook'); __import__('toolkit.evaluate'); "
-    "__import__('matplotlib.figure'); __import__('matplotlib.backends.backend_agg'); gc.freeze(); gc.enable(); del gc",
+    "__import__('matplotlib.figure'); __import__('matplotlib.backends.backend_agg'); __import__('toolkit.scene'); "
+    "__import__('importlib.util').util.find_spec('rerun') and __import__('toolkit.viewer.queries'); "
+    "gc.freeze(); gc.enable(); del gc",
 ]
 
 
@@ -86,12 +88,16 @@ class Kernels:
         for kernel in list(self._running):
             self.end(kernel)
 
+    def prepare(self) -> None:
+        """Start the kernel of the next notebook, if there is one."""
+        if self._spare is None and self.left > 0:
+            self._spare = self._start()
+
     def take(self) -> RunningKernel:
         """Return a kernel, and start the kernel of the next notebook if there is one."""
         kernel, self._spare = self._spare or self._start(), None
         self.left -= 1
-        if self.left > 0:
-            self._spare = self._start()
+        self.prepare()
         return kernel
 
     def end(self, kernel: RunningKernel) -> None:
