@@ -112,6 +112,27 @@ def test_files_of_the_capture_count_where_they_are(made: tuple[Path, Path, Path]
     assert not changed_sources(poses)
 
 
+def test_the_folder_of_the_images_stands_for_the_listed_images_and_their_masks(tmp_path: Path) -> None:
+    session, poses, images = tmp_path / "capture" / "ios_query", tmp_path / "a.txt", tmp_path / "photographs"
+    images.mkdir()
+    session.mkdir(parents=True)
+    (session / "raw_data").symlink_to(images)
+    (session / "images.txt").write_text("# timestamp, sensor_id, image_path\n1, cam, a, b.jpg\n2, cam, gone.jpg\n")
+    (images / "a, b.jpg").write_text("image")
+    poses.write_text("poses")
+    write_sidecar(poses, {}, captured=[session / "raw_data"])
+    (images / "thumbnail.jpg").write_text("not listed")
+    assert not changed_sources(poses)
+    (images / "a, b.jpg").write_text("another image")
+    assert why_older(poses, "localize") == "a.txt is of an older ios_query/raw_data: run the localize stage again."
+    write_sidecar(poses, {}, captured=[session / "raw_data"])
+    (session / "masks").mkdir()
+    (session / "masks" / "a, b.jpg.png").write_text("mask")
+    assert changed_sources(poses)
+    (images / "a, b.jpg").unlink()
+    assert not changed_sources(poses), "results are read where their images are not"
+
+
 def test_a_file_of_another_tool_has_no_sources(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("a")
     assert not changed_sources(tmp_path / "a.txt")
@@ -208,7 +229,10 @@ def linked_report(files: SceneFiles, capture: Path) -> str:
 POSES, TABLE, REFERENCES, MAP, VECTORS = "poses txt", "poses csv", "references", "map", "vectors"
 FEATURES, RECORD = "features", "run.json"
 CAMERAS, MAP_POSES, TRUTH = "cameras of queries", "poses of the map", "ground truth"
+IMAGES, MAP_IMAGES = "images of queries", "images of the map"
 CAPTURED = {
+    IMAGES: "/hl_query/raw_data",
+    MAP_IMAGES: "/ios_map/raw_data",
     CAMERAS: "/hl_query/sensors.txt",
     MAP_POSES: "/ios_map/trajectories.txt",
     TRUTH: "/hl_query/proc/alignment_trajectories.txt",
@@ -248,6 +272,14 @@ READERS = [
     (CAMERAS, exported_poses, "run the localize stage again"),
     (CAMERAS, exported_geo, "run the localize stage again"),
     (CAMERAS, submitted, "run the localize stage again"),
+    (IMAGES, reported, "is of an older hl_query/raw_data: run the localize stage again"),
+    (IMAGES, visualized, "run the localize stage again"),
+    (IMAGES, looked_at, "is of an older hl_query/raw_data: run the localize stage again"),
+    (IMAGES, inspected_again, "run the localize stage again"),
+    (IMAGES, exported_poses, "run the localize stage again"),
+    (IMAGES, exported_geo, "run the localize stage again"),
+    (IMAGES, submitted, "run the localize stage again"),
+    (MAP_IMAGES, opened, "is of an older ios_map/raw_data: run the localize stage again"),
     (CAMERAS, opened, "Map("),  # it has none of the queries' cameras
     (MAP_POSES, opened, "is of an older ios_map/trajectories.txt: run the localize stage again"),
     (TRUTH, reported, "Not shown: recall.csv is of an older proc/alignment_trajectories.txt"),

@@ -14,6 +14,7 @@ import re
 import secrets
 import shutil
 import tempfile
+import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -274,7 +275,8 @@ def write_sidecar(
     """
     files = [Path(path), *map(Path, others)]
     sources = {os.path.relpath(one, Path(path).parent): _content(one) for one in made_from}
-    sources |= {str(Path(one).resolve()): _content(one) for one in captured}  # run and capture move apart
+    # Run and capture move apart. The folder of the images may be a link.
+    sources |= {str(Path(one).parent.resolve() / Path(one).name): _content(one) for one in captured}
     record = {
         "version": __version__,
         "fingerprint": fingerprint(settings),
@@ -396,9 +398,12 @@ _TIMES = {"seconds", "first_seconds"}
 
 def _content(path: str | Path) -> str | None:
     """Return a hash of a file, which is quick for an artifact with a record; None if it is missing. The time that
-    queries took does not count: the same poses, computed again, are the same.
+    queries took does not count: the same poses, computed again, are the same. The folder `raw_data` of a session stands
+    for its images.
     """
     try:
+        if Path(path).name == RAW_DATA:
+            return _images_of(Path(path).parent)
         if Path(path).suffix == ".csv":
             with open(path, newline="", encoding="utf-8") as stream:
                 rows = csv.reader(stream)
@@ -408,6 +413,30 @@ def _content(path: str | Path) -> str | None:
         return recorded if recorded and Path(path).stat().st_size == size else checksum(path)
     except (OSError, TypeError, ValueError, AttributeError, csv.Error):
         return None
+
+
+_LISTED: dict[Path, tuple[float, str]] = {}
+"""By session: the time until which its images count as unchanged, and their hash."""
+
+
+def _images_of(session: Path) -> str | None:
+    """Return a hash of the names, sizes and times of a session's images and masks; None if all images are missing.
+
+    Looking at 200,000 files takes 2 s, and the record of each pair asks: an answer that took long is used for a while.
+    """
+    started = time.monotonic()
+    until, found = _LISTED.get(session, (0.0, ""))
+    if started < until:
+        return found
+    lines = (session / "images.txt").read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+    names = [line.split(",", 2)[2].strip() for line in lines if line.strip() and line[0] != "#"]
+    images = [session / RAW_DATA / name for name in names]
+    if not any(map(Path.exists, images)):
+        return None
+    masks = [session / MASKS / f"{name}.png" for name in names] if (session / MASKS).is_dir() else []
+    found, now = files_fingerprint(images + masks), time.monotonic()
+    _LISTED[session] = now + (20 * (now - started) if now - started > 0.1 else 0.0), found
+    return found
 
 
 def _read_record(path: str | Path) -> dict[str, Any]:
@@ -541,6 +570,8 @@ class SceneFiles:
         return self.poses_dir / f"{pair_name(self.scene, map_device, query_device)}_sequence.txt"
 
 
+RAW_DATA = "raw_data"
+"""Folder of the images of a session."""
 MASKS = "masks"
 """Folder of the masks of a session, or beside a folder of images."""
 IMPORTED = "import/images/"

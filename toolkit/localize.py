@@ -49,8 +49,8 @@ from toolkit.results.metrics import camera_messages
 from toolkit.results.pair import (
     MAPS,
     attributes,
+    pose_sources,
     query_group,
-    session_files,
     session_fingerprint,
     update_attributes,
 )
@@ -338,7 +338,7 @@ class _Pair:
             _write_poses(self.file("txt"), rows, stage.settings)
         if update_attributes(self.file("h5"), h5_attributes) or not skipped:
             files = self.file("txt"), record, [self.file("csv"), self.file("h5")]
-            captured = session_files(stage.capture[f"{self.devices[0]}_map"], self.session)
+            captured = pose_sources(stage.capture[f"{self.devices[0]}_map"], self.session)
             write_sidecar(*files, made_from=[self.retrieval, *maps], captured=captured, unfinished=unfinished)
         return skipped
 

@@ -18,7 +18,7 @@ from toolkit.figures.evaluation import SequencePair, draw_sequence, warn_of_olde
 from toolkit.figures.query_images import WorstQuery, draw_localization, draw_worst
 from toolkit.figures.style import rendered, save_figure, save_picture
 from toolkit.figures.top_view import draw_scene
-from toolkit.files import pair_name, require_current, sidecar_path, write_sidecar
+from toolkit.files import RAW_DATA, pair_name, require_current, sidecar_path, write_sidecar
 from toolkit.geometry import Floats
 from toolkit.manifest import VisualizeSettings
 from toolkit.pose.base import short_status
@@ -95,7 +95,7 @@ def visualize_scene(
         with table.row(m, q) as row:
             table.check_upstream()
             of_pair = _poses(capture, poses_dir, m, q)
-            require_current(of_pair, "localize", (".npz", ".txt"), missing=False)
+            require_current(of_pair, "localize", (".npz", ".txt", RAW_DATA), missing=False)
             pair = LocalizedPair.open(capture, m, q, poses_dir, map_dir)
             sequences = SequencePair.find(poses_dir, capture.name, m, q)
             try:

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from toolkit.capture.images import CAMERA_TYPES, default_workers, parse_camera, prefetch, read_image, stored_size
 from toolkit.capture.names import HOW_TO_ALLOW, OTHER_SESSIONS, SPLITS, has_long_part, kinds
-from toolkit.capture.session import IMPORT_RECORD, RAW_DATA, SUBSESSIONS, Capture, Session
+from toolkit.capture.session import IMPORT_RECORD, SUBSESSIONS, Capture, Session
 from toolkit.capture.tables import (
     ALIGNED,
     COLUMNS,
@@ -26,7 +26,7 @@ from toolkit.capture.tables import (
 )
 from toolkit.capture.upright import estimate_world_up, posed_photographs
 from toolkit.errors import COMMAND, CaptureError, ImageError
-from toolkit.files import read_json
+from toolkit.files import RAW_DATA, read_json
 from toolkit.geometry import unit
 
 ERROR, WARNING = "error", "warning"

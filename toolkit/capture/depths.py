@@ -23,9 +23,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from toolkit import geometry
 from toolkit.capture.images import in_view, rays_of, view_bounds
-from toolkit.capture.session import RAW_DATA, Session
+from toolkit.capture.session import Session
 from toolkit.capture.tables import read_depth
 from toolkit.errors import CaptureError
+from toolkit.files import RAW_DATA
 from toolkit.geometry import Floats, Ints
 
 log = logging.getLogger(__name__)

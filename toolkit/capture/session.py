@@ -47,7 +47,7 @@ from toolkit.capture.tables import (
     times_of,
 )
 from toolkit.errors import COMMAND, CaptureError
-from toolkit.files import MASKS, files_fingerprint, own_name, read_json
+from toolkit.files import MASKS, RAW_DATA, files_fingerprint, own_name, read_json
 from toolkit.geometry import Floats, Ints, pose_from_qt
 
 if TYPE_CHECKING:
@@ -56,7 +56,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 Strings = NDArray[np.object_]
 Rows = ArrayLike | slice | None
-RAW_DATA = "raw_data"
 SUBSESSIONS = "proc/subsessions.txt"
 IMPORT_RECORD = "proc/import.json"
 """What an import has noted in a session: the unit of its poses, `m` or null if unknown, and its inputs."""

@@ -25,7 +25,7 @@ import pandas as pd
 import PIL.Image
 import pycolmap
 
-from toolkit.capture import RAW_DATA, Session, Trajectory, parse_camera, write_session
+from toolkit.capture import Session, Trajectory, parse_camera, write_session
 from toolkit.capture.images import (
     CONVERT,
     HEIC_HOW,
@@ -58,7 +58,17 @@ from toolkit.exchange.recordings import (
     read_track,
     to_us,
 )
-from toolkit.files import IMPORTED, MASKS, own_name, read_json, recover_folder, write_atomic, write_folder, write_text
+from toolkit.files import (
+    IMPORTED,
+    MASKS,
+    RAW_DATA,
+    own_name,
+    read_json,
+    recover_folder,
+    write_atomic,
+    write_folder,
+    write_text,
+)  # fmt: skip
 from toolkit.geometry import Floats, make_pose, scaled
 from toolkit.manifest import require_known
 

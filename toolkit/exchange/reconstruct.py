@@ -29,7 +29,6 @@ from tqdm.auto import tqdm
 from toolkit.capture import Capture, Session, parse_camera
 from toolkit.capture.images import camera_text, default_workers, exif_key, prefetch, read_header
 from toolkit.capture.names import is_linked_here, note_linked_here
-from toolkit.capture.session import RAW_DATA
 from toolkit.capture.tables import write_table
 from toolkit.embedders.vlad import Vlad
 from toolkit.errors import CaptureError, ManifestError, WeightsError
@@ -53,6 +52,7 @@ from toolkit.features.stores import FeatureStore, extract_session, match_session
 from toolkit.files import (
     IMPORTED,
     MASKS,
+    RAW_DATA,
     files_fingerprint,
     link_folder,
     own_name,

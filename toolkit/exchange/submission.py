@@ -23,7 +23,7 @@ from toolkit.capture.check import UNIT_TOLERANCE
 from toolkit.capture.names import SPLITS, allow_outside, extra_devices
 from toolkit.capture.tables import read_table
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
-from toolkit.files import SceneFiles, pair_name, read_references, require_current, write_atomic
+from toolkit.files import RAW_DATA, SceneFiles, pair_name, read_references, require_current, write_atomic
 from toolkit.geometry import Floats, invert, qt_from_pose, unit
 from toolkit.manifest import require_known
 from toolkit.pose.base import Status
@@ -195,7 +195,7 @@ def _answers(
         run_table = PairResults.open(path, whole=False).table
         statuses = {(row.timestamp, row.device_id): row.status for row in run_table.itertuples()}
     if failed == "nearest" and np.any(rows < 0):
-        require_current(files.poses_txt(*pair), "localize", (".jsonl", ".txt"), missing=False)
+        require_current(files.poses_txt(*pair), "localize", (".jsonl", ".txt", RAW_DATA), missing=False)
         nearest, why_not = _nearest_references(files.retrieval(*pair))
     qt, answers = np.full((len(rows), 7), np.nan), list[tuple[str, str]]()
     qt[rows >= 0] = poses.qt[rows[rows >= 0]]

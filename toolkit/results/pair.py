@@ -25,6 +25,7 @@ from toolkit.errors import COMMAND, ArtifactError, CaptureError, DamagedError, M
 from toolkit.features.matching import LocalMethod
 from toolkit.features.stores import FeatureStore
 from toolkit.files import (
+    RAW_DATA,
     SceneFiles,
     file_fingerprint,
     fingerprint,
@@ -381,6 +382,11 @@ SESSION_FILES = "sensors.txt", "images.txt", "rigs.txt", "trajectories.txt"
 def session_files(*sessions: Session) -> list[Path]:
     """Return the existing files of `SESSION_FILES`."""
     return [path for one in sessions for name in SESSION_FILES if (path := one.path / name).exists()]
+
+
+def pose_sources(*sessions: Session) -> list[Path]:
+    """Return what poses are made from in a capture: `session_files`, and the folders that stand for the images."""
+    return [*session_files(*sessions), *(one.path / RAW_DATA for one in sessions)]
 
 
 def session_fingerprint(session: Session) -> str:

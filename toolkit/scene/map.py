@@ -31,7 +31,7 @@ from toolkit.features.matching import (
     weights_files,
 )
 from toolkit.features.stores import FeatureStore, OnDemandFeatures, extract_session
-from toolkit.files import SceneFiles, require_current
+from toolkit.files import RAW_DATA, SceneFiles, require_current
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import LocalizeSettings
 from toolkit.manifest.settings import expand
@@ -188,7 +188,7 @@ class Map:
                 raise ArtifactError(f"Map.open: found {value!r}, expected a run folder, a scene name and a device key.")
         files = SceneFiles(Path(run), scene)
         localized = last_localized(files, pairs := pairs_in_map(files, device))
-        of_map = [".jsonl", ".npz", *(f"/{device}_map/{name}" for name in SESSION_FILES)]
+        of_map = [".jsonl", ".npz", *(f"/{device}_map/{name}" for name in (*SESSION_FILES, RAW_DATA))]
         for pair in pairs:
             require_current(pair.with_suffix(".txt"), "localize", of_map, missing=False)
         reranked = Path(localized[1][RETRIEVAL]).name == files.reranked_dir.name

@@ -15,13 +15,13 @@ import rerun.blueprint as rrb
 from numpy.typing import ArrayLike
 from tqdm.auto import tqdm
 
-from toolkit.capture import DEPTH_SCALE, RAW_DATA, Capture, Session, Trajectory
+from toolkit.capture import DEPTH_SCALE, Capture, Session, Trajectory
 from toolkit.capture.images import decode, default_workers, prefetch, read_for_display, read_image
 from toolkit.capture.names import color_of
 from toolkit.capture.upright import up_of_cameras
 from toolkit.errors import ArtifactError, CaptureError, ImageError
 from toolkit.figures.style import ORANGE
-from toolkit.files import pair_devices, write_sidecar
+from toolkit.files import RAW_DATA, pair_devices, write_sidecar
 from toolkit.geometry import Floats, Ints, local_origin, shifted
 from toolkit.results.localized import sure_points
 from toolkit.results.metrics import is_posed
