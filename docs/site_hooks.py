@@ -33,6 +33,8 @@ DRAWER = {"76.25em": "68.75em", "76.234375em": "68.734375em"}
 """The width below which the theme folds its navigation away, 1,220 px, and what it becomes, 1,100 px."""
 OPTION = re.compile(r"(?<![\w-])--?[a-zA-Z][\w-]*(?![^<]*>)")
 """An option in the HTML of code, but nothing in its tags."""
+PART = re.compile(r"(?<=[\w;][/._=:,])(?=[a-zA-Z])(?![^<]*>)")
+"""Where the next part of a path or name begins in the HTML of code, but nothing in its tags."""
 SETTINGS = "<!-- all settings -->"
 """What the tables of all settings take the place of."""
 END = "...\n"  # of a YAML document that is a plain value
@@ -71,9 +73,13 @@ def on_page_markdown(markdown: str, page: "Page", **_: Any) -> str:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Keep options such as `--hold-out` in one line; browsers would break it after each hyphen."""
+    """Keep options such as `--hold-out` in one line; browsers would break it after each hyphen.
+
+    In cells of tables, long names may be broken after a slash, a dot or an underscore, where site.css allows it.
+    """
     kept = r'<span class="option">\g<0></span>'
-    return re.sub(r"(?s)<code>.*?</code>", lambda found: OPTION.sub(kept, found[0]), html)
+    text = re.sub(r"(?s)<code>.*?</code>", lambda found: OPTION.sub(kept, found[0]), html)
+    return re.sub(r"<code>[^\n]*?</code>(?=(?:(?!<td)[^\n])*</td>)", lambda found: PART.sub("<wbr>", found[0]), text)
 
 
 def on_post_build(config: "MkDocsConfig") -> None:

@@ -204,6 +204,14 @@ def test_options_stay_in_one_line() -> None:
     assert site_hooks.on_page_content("<p>--x</p>") == "<p>--x</p>"
 
 
+def test_long_names_in_tables_are_broken_between_their_parts() -> None:
+    link = '<a href="a/b.html#c_d"><code>cam_from_world</code></a>'
+    cell = f"<td><code>data/7scenes.txt</code>, {link}, <code>0.3 deg, a_b</code></td>"
+    assert site_hooks.on_page_content(f"<p>{link}</p>") == f"<p>{link}</p>"
+    expected = cell.replace("7scenes.", "7scenes.<wbr>").replace("cam_from_", "cam_<wbr>from_<wbr>")
+    assert site_hooks.on_page_content(cell) == expected.replace("a_b<", "a_<wbr>b<")
+
+
 def test_the_page_of_settings_has_all_of_them() -> None:
     assert site_hooks.SETTINGS in (ROOT / "docs" / "settings.md").read_text()
     rows = [line for line in site_hooks.settings_tables() if line.startswith("| `")]
