@@ -25,6 +25,7 @@ from toolkit import embed, evaluate, localize, notebook, pipeline, rerank, retri
 from toolkit.figures import explore  # noqa: F401
 from toolkit.files import write_atomic
 from toolkit.report import page  # noqa: F401
+from toolkit.runs.kernel import TEXT_BARS
 
 CHANGES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}
 """Audit events that change a folder; `open` for writing is the other."""
@@ -128,9 +129,24 @@ def attempt(manifest: Path, asked: dict[str, Any]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
+    import gc
+
+    # What a child would import with its first query or figure.
     import matplotlib as mpl
     import matplotlib.pyplot
+    import pandas.io.formats.style  # noqa: F401
+    import scipy.cluster.hierarchy  # noqa: F401
+    import torch  # noqa: F401
+    from IPython.display import HTML  # noqa: F401
+    from matplotlib.backends import backend_agg  # noqa: F401
+    from PIL import Image
 
+    from toolkit import scene  # noqa: F401
+    from toolkit.viewer import queries  # noqa: F401
+
+    Image.init()
     mpl.use("Agg")
+    os.environ[TEXT_BARS] = "1"  # as in the kernels of a run, which show no viewer
+    gc.freeze()  # children look through what they make, and share what is here
     for line in sys.stdin:
         print(json.dumps(attempt(Path(sys.argv[1]), json.loads(line))), flush=True)
