@@ -2,9 +2,8 @@
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import nbformat
@@ -13,7 +12,7 @@ import pandas as pd
 import pytest
 
 from tests.rendered import copy_linked
-from tests.unattended import execute_cells, run_cells
+from tests.unattended import no_kernels, run_cells
 from toolkit import notebook, pipeline
 from toolkit.capture import Capture
 from toolkit.capture.session import IMPORT_RECORD
@@ -94,17 +93,11 @@ def retrieved(small_run: Path, small_capture: Path, tmp_path_factory: pytest.Tem
 
 
 @pytest.fixture
-def small_images_of_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+def small_images_of_networks(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Networks that predict poses get images of 126 pixels, also in a run, which therefore has no kernel."""
-
-    def execute_here(*arguments: Any) -> tuple[Any, float]:
-        with pytest.MonkeyPatch.context() as patch:  # what the cells are given
-            patch.setattr("IPython.display.display", quiet)
-            patch.setattr(notebook, "_user_names", dict)
-            return execute_cells(SimpleNamespace(), *arguments)
-
-    monkeypatch.setattr(pipeline, "execute", execute_here)
     monkeypatch.setattr(da3, "SIDE", 126)
+    with no_kernels():
+        yield
 
 
 def localize_by_hand(monkeypatch: pytest.MonkeyPatch, parameters: dict[str, Any]) -> None:

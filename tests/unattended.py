@@ -14,10 +14,14 @@ import signal
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import nbformat
+import pytest
 from nbformat.v4 import new_output
 
 # Imported before the first fork, all that the cells need.
@@ -62,7 +66,7 @@ def run_cells(content: Any, variables: dict[str, Any], parameters: dict[str, Any
 
 
 def execute_cells(
-    events: Events, path: Path, output: Path, parameters: dict[str, Any], *_: object
+    events: Events | SimpleNamespace, path: Path, output: Path, parameters: dict[str, Any], *_: object
 ) -> tuple[Any, float]:
     """Do what `toolkit.notebook.execute` does, in this process; of what cells display, counts alone are kept."""
     import IPython.display
@@ -84,6 +88,25 @@ def execute_cells(
     with write_atomic(output) as temporary:
         nbformat.write(content, temporary)
     return content, 1.0
+
+
+@contextmanager
+def no_kernels() -> Iterator[None]:
+    """Runs execute the cells of their notebooks in this process, in the folder where a kernel would."""
+
+    def execute_here(path: Path, output: Path, *arguments: Any) -> tuple[Any, float]:
+        with pytest.MonkeyPatch.context() as inside:
+            inside.setenv(TEXT_BARS, "1")  # as in a kernel
+            inside.setattr("IPython.display.display", None)  # what follows changes these two, which are put back
+            inside.setattr(notebook, "_user_names", dict)
+            output = output.resolve()
+            output.parent.mkdir(exist_ok=True)
+            inside.chdir(output.parent)
+            return execute_cells(SimpleNamespace(), path, output, *arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "execute", execute_here)
+        yield
 
 
 def run_in_child(manifest: Path, asked: dict[str, Any], tell: int, answer: int) -> None:
