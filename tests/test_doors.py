@@ -88,7 +88,8 @@ def retrieved(small_run: Path, small_capture: Path, tmp_path_factory: pytest.Tem
     shutil.rmtree(files.poses_dir)
     manifest = folder / f"{small_run.name}.yaml"
     manifest.write_text(f"captures: ['{capture}']\noutput_root: .\n")
-    pipeline.run(manifest, only="embed,retrieve", say=quiet, in_place=True)
+    with no_kernels():
+        pipeline.run(manifest, only="embed,retrieve", say=quiet, in_place=True)
     return files
 
 
