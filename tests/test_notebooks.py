@@ -18,6 +18,7 @@ import nbformat
 import pandas as pd
 import pytest
 
+from tests.unattended import no_kernels
 from toolkit import notebook, pipeline
 from toolkit.errors import ArtifactError, ManifestError, StageError
 from toolkit.manifest import OPTIONAL, STAGES, Manifest, RerankSettings, RetrieveSettings
@@ -159,7 +160,8 @@ def test_the_notebook_localizes_by_hand_as_the_run_did(small_capture: Path, tmp_
     manifest = tmp_path / "near.yaml"
     manifest.write_text(f"captures: ['{small_capture}']\noutput_root: .\nqueries: all\npairs: [[ios, hl]]\n"
                         "rerank: {topn: 6, topk: 3}\nlocalize: {method: nearest}\n")  # fmt: skip
-    pipeline.run(manifest, "embed,retrieve,rerank,localize", say=lambda *a, **k: None)
+    with no_kernels():
+        pipeline.run(manifest, "embed,retrieve,rerank,localize", say=lambda *a, **k: None)
     chosen = {"run": str(tmp_path / "near"), "pairs": [["ios", "hl"]]}
     notebook.execute(notebook_path("localize"), tmp_path / "04.ipynb", chosen)
     poses = "SMALL/poses/SMALL_map_ios_query_hl.txt"
@@ -440,7 +442,8 @@ def test_a_capture_without_truth_has_a_report_too(small_capture: Path, small_run
     (tmp_path / "untrue.yaml").write_text(f"captures: ['{capture}']\noutput_root: runs\nvisualize: {quick}\n")
     run = tmp_path / "runs" / "untrue"
     shutil.copytree(small_run / "SMALL", run / "SMALL", ignore=shutil.ignore_patterns(".stages", "evaluation"))
-    pipeline.run(tmp_path / "untrue.yaml", say=lambda *a, **k: None)
+    with no_kernels():
+        pipeline.run(tmp_path / "untrue.yaml", say=lambda *a, **k: None)
     rows = {row["stage"]: row for row in json.loads((run / "run.json").read_text())["stages"]}
     assert {row["status"] for row in rows.values()} == {"done"}
     assert set(pd.read_csv(run / "SMALL" / "evaluation" / "losses.csv")["state"]) == {"no ground truth"}

@@ -14,10 +14,14 @@ import signal
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import nbformat
+import pytest
 from nbformat.v4 import new_output
 
 # Imported before the first fork, all that the cells need.
@@ -25,6 +29,7 @@ from toolkit import embed, evaluate, localize, notebook, pipeline, rerank, retri
 from toolkit.figures import explore  # noqa: F401
 from toolkit.files import write_atomic
 from toolkit.report import page  # noqa: F401
+from toolkit.runs.kernel import TEXT_BARS
 
 CHANGES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}
 """Audit events that change a folder; `open` for writing is the other."""
@@ -61,7 +66,7 @@ def run_cells(content: Any, variables: dict[str, Any], parameters: dict[str, Any
 
 
 def execute_cells(
-    events: Events, path: Path, output: Path, parameters: dict[str, Any], *_: object
+    events: Events | SimpleNamespace, path: Path, output: Path, parameters: dict[str, Any], *_: object
 ) -> tuple[Any, float]:
     """Do what `toolkit.notebook.execute` does, in this process; of what cells display, counts alone are kept."""
     import IPython.display
@@ -83,6 +88,25 @@ def execute_cells(
     with write_atomic(output) as temporary:
         nbformat.write(content, temporary)
     return content, 1.0
+
+
+@contextmanager
+def no_kernels() -> Iterator[None]:
+    """Runs execute the cells of their notebooks in this process, in the folder where a kernel would."""
+
+    def execute_here(path: Path, output: Path, *arguments: Any) -> tuple[Any, float]:
+        with pytest.MonkeyPatch.context() as inside:
+            inside.setenv(TEXT_BARS, "1")  # as in a kernel
+            inside.setattr("IPython.display.display", None)  # what follows changes these two, which are put back
+            inside.setattr(notebook, "_user_names", dict)
+            output = output.resolve()
+            output.parent.mkdir(exist_ok=True)
+            inside.chdir(output.parent)
+            return execute_cells(SimpleNamespace(), path, output, *arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "execute", execute_here)
+        yield
 
 
 def run_in_child(manifest: Path, asked: dict[str, Any], tell: int, answer: int) -> None:
@@ -128,9 +152,24 @@ def attempt(manifest: Path, asked: dict[str, Any]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
+    import gc
+
+    # What a child would import with its first query or figure.
     import matplotlib as mpl
     import matplotlib.pyplot
+    import pandas.io.formats.style  # noqa: F401
+    import scipy.cluster.hierarchy  # noqa: F401
+    import torch  # noqa: F401
+    from IPython.display import HTML  # noqa: F401
+    from matplotlib.backends import backend_agg  # noqa: F401
+    from PIL import Image
 
+    from toolkit import scene  # noqa: F401
+    from toolkit.viewer import queries  # noqa: F401
+
+    Image.init()
     mpl.use("Agg")
+    os.environ[TEXT_BARS] = "1"  # as in the kernels of a run, which show no viewer
+    gc.freeze()  # children look through what they make, and share what is here
     for line in sys.stdin:
         print(json.dumps(attempt(Path(sys.argv[1]), json.loads(line))), flush=True)
