@@ -21,7 +21,6 @@ _ARGUMENTS = [
     # would search these 200,000 objects again and again (15 % of the imports' time, 5 % of that of drawing).
     "--IPKernelApp.exec_lines=import gc; gc.disable(); __import__('toolkit.notebook'); __import__('toolkit.evaluate'); "
     "__import__('matplotlib.figure'); __import__('matplotlib.backends.backend_agg'); __import__('toolkit.scene'); "
-    "__import__('importlib.util').util.find_spec('rerun') and __import__('toolkit.viewer.queries'); "
     "gc.freeze(); gc.enable(); del gc",
 ]
 
