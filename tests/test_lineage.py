@@ -129,6 +129,10 @@ def test_the_folder_of_the_images_stands_for_the_listed_images_and_their_masks(t
     (session / "masks").mkdir()
     (session / "masks" / "a, b.jpg.png").write_text("mask")
     assert changed_sources(poses)
+    write_sidecar(poses, {}, captured=[session / "raw_data"])
+    with open(session / "images.txt", "a") as listed:
+        listed.write("3, cut short\n")
+    assert changed_sources(poses), "a damaged list is no error here"
     (images / "a, b.jpg").unlink()
     assert not changed_sources(poses), "results are read where their images are not"
 

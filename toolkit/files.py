@@ -429,7 +429,7 @@ def _images_of(session: Path) -> str | None:
     if started < until:
         return found
     lines = (session / "images.txt").read_text(encoding="utf-8", errors="surrogateescape").splitlines()
-    names = [line.split(",", 2)[2].strip() for line in lines if line.strip() and line[0] != "#"]
+    names = [line.split(",", 2)[-1].strip() for line in lines if line.strip() and line[0] != "#"]
     images = [session / RAW_DATA / name for name in names]
     if not any(map(Path.exists, images)):
         return None

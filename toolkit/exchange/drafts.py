@@ -68,7 +68,7 @@ from toolkit.files import (
     write_atomic,
     write_folder,
     write_text,
-)  # fmt: skip
+)
 from toolkit.geometry import Floats, make_pose, scaled
 from toolkit.manifest import require_known
 
