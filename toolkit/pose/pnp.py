@@ -382,7 +382,10 @@ class PnpLocalizer(Localizer):
             return estimate
         if estimate.world_from_rig is None or not any(_differ(hypotheses[0], one) for one in found):
             return estimate
-        return self._estimate(query, matches, _best_first([*hypotheses, *found]), references)
+        # One pose, found from two starts, differs in the last digits: the first stays.
+        best = hypotheses[0].world_from_rig
+        others = [one for one in found if not agree(best, one.world_from_rig, NEAR_DISTANCE)]
+        return self._estimate(query, matches, _best_first([*hypotheses, *others]), references)
 
     def _first_pose(
         self, of_query: PnpMatches, references: Sequence[References]
