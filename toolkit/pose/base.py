@@ -432,7 +432,9 @@ class View:
         """
         if (color, least_side) not in self._decoded:
             pixels = pixels_of(self.image, not color, least_side)
-            width, height = stored_size(self.image) if isinstance(self.image, Path) else pixels.shape[1::-1]
+            width, height = pixels.shape[1::-1]
+            if least_side is not None and isinstance(self.image, Path):  # perhaps decoded at a smaller size
+                width, height = stored_size(self.image)
             if (self.camera.width, self.camera.height) != (width, height):
                 raise CameraError(
                     f"The image is {width} x {height} pixels, its camera {self.camera.width} x "

@@ -483,7 +483,7 @@ class Map:
         """Return a result with the names of images and method; with low confidence if the map contradicts itself."""
         posed, images = result.world_from_rig is not None, tuple(view.name for view in query.views)
         method = result.found_by if posed else ""
-        if self.settings.predicts and self.settings.predictor.name == "simulated":
+        if self.settings.predictor.name == "simulated" and self.settings.predicts:
             method = f"{self.settings.method}:simulated" + (f"/{method}" if method else "")
         result = replace(result, images=images, found_by=method or self.settings.method)
         if self.consistency.trusted or not posed:

@@ -27,7 +27,7 @@ from toolkit.capture.images import (
     turn_image,
 )
 from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_folders, open_descriptors, shows_upright
-from toolkit.embedders.search import VectorIndex, embedder_fingerprint, load_index, search
+from toolkit.embedders.search import VectorIndex, embedder_fingerprint, fuse, load_index, search
 from toolkit.errors import COMMAND, ArtifactError, CameraError, ImageError, ManifestError
 from toolkit.features.features import KINDS, SiftExtractor, usable
 from toolkit.features.matching import LocalMethod, Verifier, create_local_methods
@@ -57,7 +57,7 @@ Map = Any
 CHANGEABLE = ("localize", "retrieve.topk")
 """Sections and keys of a manifest that can be changed for one query."""
 MAX_IN_MEMORY = 1 << 30
-"""Largest size in bytes of global descriptors (float32) that an open map keeps in memory; larger ones stay on disk."""
+"""Largest size in bytes of global descriptors (float64) that an open map keeps in memory; larger ones stay on disk."""
 Ranked = tuple[NDArray[np.int64], NDArray[np.float64]]
 """Rows (k,) of map images in their session, best first, and their scores (k,)."""
 
@@ -457,9 +457,7 @@ class ReferenceSearch:
         By default, there are `k` as in the run; `allowed` has, for each image, a mask over the rows `rows`, or None.
         Raise ArtifactError if the map was embedded by another embedder.
         """
-        stored, rows = self._stored
-        dims = stored.dims
-        for embedder, described, dim in zip(self.embedders, query.descriptors, dims, strict=True):
+        for embedder, described, dim in zip(self.embedders, query.descriptors, self._stored[0].dims, strict=True):
             if described.shape[1] != dim:
                 raise ArtifactError(
                     f"{self.files.embeddings}: found descriptors of {dim} dimensions for the map, expected "
@@ -467,19 +465,28 @@ class ReferenceSearch:
                 )
         searched = np.hstack([self._as_searched(vectors) for vectors in query.descriptors])
         topk = self.retrieve_settings.topk if k is None or self.reranked else k
-        masks = list(allowed) or [None]
-        results = [
-            search(part, self._descriptors, topk, "torch", "cpu", index=self._index, allowed=mask, dims=dims)
-            for part, mask in zip(np.split(searched, len(masks)), masks, strict=True)
-        ]
-        all_scores, neighbors = (np.concatenate(arrays) for arrays in zip(*results, strict=True))
-        ranked = [
-            (rows[indices[indices >= 0]], scores[indices >= 0].astype(np.float64))
-            for indices, scores in zip(neighbors, all_scores, strict=True)
-        ]
+        masks = list(allowed) or [None] * len(searched)
+        ranked = [self._nearest(vector, topk, mask) for vector, mask in zip(searched, masks, strict=True)]
         if self.reranked:
             ranked = [self._rerank(of_image, view) for of_image, view in zip(ranked, query.views, strict=True)]
         return [(of_image[:k], scores[:k]) for of_image, scores in ranked]
+
+    def _nearest(self, vector: NDArray[np.float32], k: int, allowed: NDArray[np.bool_] | None) -> Ranked:
+        """Return the k map images that are most similar to a vector, with the scores and in the order of `search`."""
+        of_map, rows, dims = self._descriptors, self.rows, self._stored[0].dims
+        if self._index is not None or isinstance(of_map, Vectors):
+            found = search(vector[None], of_map, k, "torch", "cpu", index=self._index, allowed=allowed, dims=dims)
+            scores, nearest = (of_vector[0, found[1][0] >= 0] for of_vector in found)
+            return rows[nearest], scores.astype(np.float64)
+        ends = np.cumsum(dims)[:-1]
+        parts = zip(np.split(of_map, ends, axis=1), np.split(vector.astype(np.float64), ends), strict=True)
+        products = [np.einsum("nd,d->n", descriptors, described) for descriptors, described in parts]
+        scores = (products[0] if len(products) == 1 else fuse(products)).astype(np.float32)
+        if not np.isfinite(scores).all():
+            raise ValueError("The descriptors of the query or of the map have NaN or infinite values.")
+        candidates = np.arange(len(rows)) if allowed is None else np.flatnonzero(allowed)
+        nearest = candidates[np.argsort(-scores[candidates], kind="stable")[:k]]
+        return rows[nearest], scores[nearest].astype(np.float64)
 
     def _rerank(self, ranked: Ranked, view: View) -> Ranked:
         """Return rows of map images and their numbers of verified matches, most first, as the rerank stage does."""
@@ -543,10 +550,11 @@ class ReferenceSearch:
         return vectors.choose(np.flatnonzero(posed)), rows[posed]
 
     @cached_property
-    def _descriptors(self) -> NDArray[np.float32] | Vectors:
+    def _descriptors(self) -> Floats | Vectors:
         """Those of `_stored`, in memory unless the map is large."""
         vectors = self._stored[0]
-        return vectors[:] if 4 * vectors.shape[1] * len(vectors) < MAX_IN_MEMORY else vectors
+        in_memory = np.dtype(np.float64).itemsize * vectors.shape[1] * len(vectors) < MAX_IN_MEMORY
+        return vectors[:].astype(np.float64) if in_memory else vectors
 
     @cached_property
     def _index(self) -> VectorIndex | None:
