@@ -33,8 +33,8 @@ from toolkit.pose.base import (
     Status,
     View,
 )
-from toolkit.scene.map import Map, localize_images
-from toolkit.scene.query import ReferenceSearch
+from toolkit.scene.images import localize_images
+from toolkit.scene.map import Map, ReferenceSearch
 
 
 class Scripted(Localizer):

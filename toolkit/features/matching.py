@@ -232,6 +232,24 @@ def create_local_methods(
 AnyMethod = LocalMethod | DeferredMethod
 
 
+def create_methods(settings: LocalizeSettings) -> tuple[list[LocalMethod], list[DeferredMethod]]:
+    """Return the kinds of features that every query needs, and those for queries without a sure pose.
+
+    Raise WeightsError if a network has no weights.
+    """
+    if settings.method == "nearest":
+        return [], []
+    further = settings.features.escalation if settings.method in ("pnp", "hybrid") else []
+    if further:
+        weights_files(settings)
+    return create_local_methods(settings), [DeferredMethod(settings, name) for name in further]
+
+
+def needs_upright(settings: LocalizeSettings, kinds: Sequence[AnyMethod]) -> bool:
+    """Tell whether a network that localizes needs upright images; `kinds` are the kinds of features."""
+    return settings.predicts or any(feature_types.KINDS[kind.name].upright for kind in kinds)
+
+
 def unit_descriptors(descriptors: Descriptors, shorten: Shorten | None = None) -> NDArray[np.float32]:
     """Return the descriptors (N, D) of `LocalFeatures` as float32 vectors of length about 1; for `shorten` see
     `FeatureKind`.

@@ -230,7 +230,7 @@ class QueryResult:
         return self._in_map.show_3d([self, *others], rays)
 
     def what_if(self, changes: Mapping[str, Any] | None = None, **more: Any) -> Any:
-        """Localize the query again with something changed; see `scene.query.Located.what_if`."""
+        """Localize the query again with something changed; see `scene.query.what_if`."""
         return self._in_map.what_if(self, changes or {}, **more)
 
     def __getstate__(self) -> dict[str, Any]:
