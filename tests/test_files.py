@@ -175,6 +175,20 @@ def test_a_record_of_another_version_is_not_current(tmp_path: Path) -> None:
     assert not files.is_current(path, {"a": 1})
 
 
+def test_an_older_record_without_sources_is_not_called_damaged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "a.npy"
+    path.write_text("x")
+    files.write_sidecar(path, {"a": 1})
+    record = json.loads(files.sidecar_path(path).read_text())
+    older = {key: value for key, value in record.items() if key not in ("made_from", "sources")}
+    files.sidecar_path(path).write_text(json.dumps(older))
+    assert not files.is_current(path, {"a": 1})
+    assert "of an older version" in caplog.text
+    assert "damaged" not in caplog.text
+
+
 def flip(path: Path) -> None:
     """Change one bit; size and time of change stay."""
     data, state = bytearray(path.read_bytes()), path.stat()

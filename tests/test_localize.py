@@ -43,9 +43,20 @@ from toolkit.files import SceneFiles, image_name, map_record_path, read_map_reco
 from toolkit.localize import COLUMNS, Map, localize_image, localize_pairs
 from toolkit.manifest import EmbedSettings, LocalizeSettings
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.base import Localizer, Prior, Query, QueryMatches, QueryResult, References, RoughPose, Status, View
+from toolkit.pose.base import (
+    NOISE,
+    Localizer,
+    Prior,
+    Query,
+    QueryMatches,
+    QueryResult,
+    References,
+    RoughPose,
+    Status,
+    View,
+)
 from toolkit.pose.map_matching import MappedFeatures
-from toolkit.pose.pnp import PnpLocalizer
+from toolkit.pose.pnp import CURE, PnpLocalizer
 from toolkit.prediction import network as predictors
 from toolkit.prediction.interface import Prediction
 from toolkit.prediction.network import SimulatedPredictor
@@ -1418,6 +1429,8 @@ def test_no_pose_is_ok_in_a_map_that_contradicts_its_images(
     judged = place.finished(Query([], np.eye(4)[None]), right)
     assert (judged.status, judged.reason[:9]) == (Status.LOW_CONFIDENCE, "the poses")
     assert "OpenGL" in judged.remark
+    blamed = QueryResult(Status.LOW_CONFIDENCE, world_from_rig=np.eye(4), reason=NOISE, remark=f"it may be off; {CURE}")
+    assert CURE not in place.finished(Query([], np.eye(4)[None]), blamed).remark  # it would not cure this map
     session = Capture.open(capture)["ios_query"]
     picture = localize_image(place, session.image_path(0), session.camera(session.images["sensor_id"].iloc[0]))
     assert picture.status != "ok"

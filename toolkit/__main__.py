@@ -306,14 +306,16 @@ def check(
 @app.command()
 def new(
     name: Annotated[str, Argument(help="Name of the manifest and its run, runs/<name>: letters, digits, -, _.")],
-    capture: Annotated[Path | None, Argument(help="Capture folder; default: a placeholder to fill in.")] = None,
+    capture: Annotated[Path | None, Argument(help="Capture folder; default: NAME, else a line to fill in.")] = None,
     out: Annotated[Path, Option(help="Folder of the manifest.")] = Path("data_manifests"),
 ) -> None:
     """Write a manifest for a capture, with explanations and the findings of `check`."""
     from toolkit.exchange.import_report import new_manifest
 
+    if capture is None and Path(name, "sessions").is_dir():
+        capture = Path(name)
     path = new_manifest(name, capture, out)
-    print(f"Manifest: {path}\nRun it: {COMMAND} run {path}")
+    print(f"Manifest: {path}{'' if capture else '. Name your capture in it.'}\nRun it: {COMMAND} run {path}")
 
 
 @app.command()

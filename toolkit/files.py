@@ -469,7 +469,8 @@ def _damage(path: str | Path, record: dict[str, Any], only: str | None = None) -
         return f"{error.filename or path} cannot be read ({error.strerror})"
     except (ValueError, TypeError, AttributeError):
         whole = False
-    return "" if whole else f"{sidecar_path(path)} is damaged"
+    older = "fingerprint" in record and not record.keys() & {"sources", "made_from"}
+    return "" if whole else f"{sidecar_path(path)} is {'of an older version of the toolkit' if older else 'damaged'}"
 
 
 def _jsonable(value: Any) -> Any:

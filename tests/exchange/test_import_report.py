@@ -37,6 +37,17 @@ def test_the_manifest_is_the_template_with_the_capture_in_it(
         new_manifest("my-place", place)
 
 
+def test_a_capture_of_the_given_name_is_meant(
+    small_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("PLACE").symlink_to(small_capture)
+    assert "Name your capture" not in CliRunner().invoke(app, ["new", "PLACE"]).output
+    (capture,) = load_manifest("data_manifests/PLACE.yaml").captures
+    assert Path(capture).resolve() == small_capture.resolve()
+    assert "Name your capture" in CliRunner().invoke(app, ["new", "OTHER"]).output
+
+
 def test_an_unknown_unit_and_a_missing_list_are_set(small_capture: Path, tmp_path: Path) -> None:
     sessions = tmp_path / "PLACE" / "sessions"
     for name in ("ios_map", "ios_query"):

@@ -178,11 +178,13 @@ class MappedFeatures:
             # Compare each near keypoint with all observations of the point; the most similar one counts.
             count = counts[near_point]
             pair = np.repeat(np.arange(len(near)), count)
-            within = np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
-            observation = by_point[np.repeat(starts[near_point], count) + within]
+            shift = starts[near_point] - (np.cumsum(count) - count)
+            observation = by_point[np.arange(len(pair)) + np.repeat(shift, count)]
             expected_px = size * query.focals_px[camera] / np.maximum(in_cam[which, 2], 1e-6)
             expected, actual = (np.log2(np.maximum(px, 1e-6)) for px in (expected_px, features.scales.astype(float)))
-            similar = np.abs(actual[keypoint[pair]] - expected[observation]) < self.kind.scale_octaves
+            octaves = np.repeat(actual[keypoint], count)
+            octaves -= expected[observation]
+            similar = np.flatnonzero(np.abs(octaves, out=octaves) < self.kind.scale_octaves)
             pair, observation = pair[similar], observation[similar]
             unit_query = query.unit_descriptors(camera, kind, self.kind.shorten)
             scores = _similarities(unit, observation, unit_query, keypoint[pair])
@@ -190,7 +192,9 @@ class MappedFeatures:
             score, pair = np.maximum.reduceat(scores, first) if len(first) else scores, pair[first]
             good = np.flatnonzero(score > self.kind.guided_min_score)
             near_point, keypoint = near_point[pair[good]], keypoint[pair[good]]
-            order = np.lexsort((near_point * len(features) + keypoint, -score[good]))
+            # Highest score first, then by point and keypoint, as one number: bits of positive floats sort as they do.
+            bits = score[good].view(np.int32).astype(np.int64)
+            order = np.argsort(near_point * len(features) + keypoint - (bits << 32))
             near_point, keypoint = near_point[order], keypoint[order]
             pixels = features.keypoints[keypoint].astype(np.float64)
             yield Candidates(Matches(np.full(len(good), camera), pixels, point[near_point]), keypoint)
@@ -201,9 +205,14 @@ def _similarities(
 ) -> NDArray[np.float32]:
     """Return the cosine similarities (K,) of K pairs of rows of unit descriptors."""
     scores = np.empty(len(rows_a), np.float32)
-    for start in range(0, len(rows_a), 512):  # both sides of so many pairs fit into the cache
-        pairs = slice(start, start + 512)
-        scores[pairs] = np.einsum("kd,kd->k", unit_a[rows_a[pairs]], unit_b[rows_b[pairs]])
+    a, b = np.empty((2, 512, unit_a.shape[1]), np.float32)  # both sides of so many pairs fit into the cache
+    for start in range(0, len(rows_a), len(a)):
+        pairs = slice(start, start + len(a))
+        some = slice(len(rows_a[pairs]))
+        # With `clip`, NumPy writes to `out` at once.
+        unit_a.take(rows_a[pairs], axis=0, out=a[some], mode="clip")
+        unit_b.take(rows_b[pairs], axis=0, out=b[some], mode="clip")
+        np.einsum("kd,kd->k", a[some], b[some], out=scores[pairs])
     return scores
 
 

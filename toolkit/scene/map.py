@@ -473,8 +473,9 @@ class Map:
         result = replace(result, images=images, found_by=method or self.settings.method)
         if self.consistency.trusted or not posed:
             return result
-        # In such a map, a misfit says nothing about the query's camera.
-        remark = "; ".join(filter(None, ["" if result.misfit else result.remark, self.consistency.text]))
+        # In such a map, a misfit says nothing about the query's camera, and what is called noise has another cause.
+        blamed = result.misfit or result.reason == NOISE
+        remark = "; ".join(filter(None, ["" if blamed else result.remark, self.consistency.text]))
         what = "poses" if self.consistency.verdict == "inconsistent" else "intrinsics"
         reason = f"the {what} of the map contradict its images"
         return replace(result, status=Status.LOW_CONFIDENCE, reason=reason, remark=remark, focals_px=(), centers_px=())
