@@ -35,8 +35,8 @@ from toolkit.embed import embed_sessions
 from toolkit.embedders import EMBEDDERS
 from toolkit.errors import ArtifactError, CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.evaluate import evaluate_scene
-from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor, SiftSettings
-from toolkit.features.matching import MATCHERS, LocalMethod, MutualMatcher, unit_descriptors
+from toolkit.features.features import KINDS, LocalFeatures, MutualMatcher, SiftExtractor, SiftSettings, unit_descriptors
+from toolkit.features.matching import MATCHERS, LocalMethod
 from toolkit.features.stores import extract_session
 from toolkit.figures import top_view
 from toolkit.files import SceneFiles, image_name, map_record_path, read_map_record, read_references, sidecar_path

@@ -18,14 +18,8 @@ from toolkit.capture.images import default_workers, prefetch
 from toolkit.capture.tables import POSES_UNIT, in_unit_of_poses, read_query_table
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import ToolkitError, reason_of
-from toolkit.features.matching import (
-    AnyMethod,
-    MutualMatcher,
-    create_methods,
-    needs_upright,
-    resolve_auto,
-    weights_files,
-)
+from toolkit.features.features import MutualMatcher
+from toolkit.features.matching import AnyMethod, create_methods, needs_upright, resolve_auto, weights_files
 from toolkit.features.stores import FeatureStore, extract_session, match_sessions
 from toolkit.files import (
     Remade,

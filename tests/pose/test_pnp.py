@@ -14,8 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from tests.queries import ask, indices_of, rests_on
 from toolkit import geometry
-from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, LocalFeatures
-from toolkit.features.matching import MutualMatcher, PairMatches, unit_descriptors
+from toolkit.features.features import (
+    DESCRIPTOR_SCALE,
+    KINDS,
+    LocalFeatures,
+    MutualMatcher,
+    PairMatches,
+    unit_descriptors,
+)
 from toolkit.manifest import PnpSettings
 from toolkit.mapping.local_map import Consistency, LocalMap
 from toolkit.pose import map_matching as matches

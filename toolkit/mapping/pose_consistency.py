@@ -20,8 +20,8 @@ from scipy.spatial import KDTree
 
 from toolkit import geometry
 from toolkit.capture.images import default_workers, prefetch, rays_of
-from toolkit.features.features import FeatureKind, LocalFeatures
-from toolkit.features.matching import MutualMatcher, verified_matches
+from toolkit.features.features import FeatureKind, LocalFeatures, MutualMatcher
+from toolkit.features.matching import verified_matches
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import RerankSettings
 from toolkit.mapping.local_map import OPENGL_AXES, Consistency, LocalMap

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from toolkit import geometry
 from toolkit.capture.images import camera_text, pixels_of, stored_size, thumbnails
 from toolkit.errors import INTERNAL, ArtifactError, CameraError
-from toolkit.features.features import KINDS, LocalFeatures, extract_turned, usable
-from toolkit.features.matching import AnyMethod, PairMatches
+from toolkit.features.features import KINDS, LocalFeatures, PairMatches, extract_turned, usable
+from toolkit.features.matching import AnyMethod
 from toolkit.geometry import Floats, Ints
 
 CAMERA = "camera?"
