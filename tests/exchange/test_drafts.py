@@ -45,6 +45,15 @@ def texts(session: Path) -> dict[str, str]:
     return {path.relative_to(session).as_posix(): path.read_text() for path in session.rglob("*.txt")}
 
 
+def test_up_of_images_that_look_straight_down_is_called_a_guess(tmp_path: Path) -> None:
+    names = [f"{number}.jpg" for number in range(4)]
+    poses = [f"{name},0,1,0,0,{number},0,80" for number, name in enumerate(names)]  # half a turn about x: along -z
+    (tmp_path / "t.csv").write_text("\n".join(["image,qw,qx,qy,qz,tx,ty,tz", *poses]))
+    command = ["import", "images", str(photos(tmp_path / "photos", *names)), str(tmp_path / "PLACE"), "--split", "map"]
+    done = CliRunner().invoke(app, [*command, "--table", str(tmp_path / "t.csv"), "--camera", CAMERA, "--json"])
+    assert json.loads(done.stdout)["ios_map"]["up"] == "(0.00, 0.00, 1.00), a guess: all look along -z"
+
+
 def test_a_report_says_what_was_used_left_out_and_assumed(tmp_path: Path) -> None:
     folder = photos(tmp_path / "photos", "a.jpg", "b.jpg", "c.jpg", "d.jpg", "not_listed.jpg")
     PIL.Image.new("RGB", (32, 24)).save(folder / "b.jpg")

@@ -74,7 +74,7 @@ def estimate_world_up(sessions: Sequence[Session]) -> WorldUp:
     for record in (read_json(session.path / IMPORT_RECORD) for session in sessions):
         if record.get("z is up"):
             return WorldUp(np.array([0.0, 0.0, 1.0]), True, record["up"])
-    if _look_down_z(axes):
+    if look_down_z(axes):
         reason = f"(0, 0, 1), a guess from {count} images that all look along -z: straight down, if z is up"
         return WorldUp(np.array([0.0, 0.0, 1.0]), False, reason)
     up, difference = _most_upright(axes, centers, groups)
@@ -95,13 +95,13 @@ def up_of_cameras(world_from_cams: ArrayLike) -> Floats:
     poses = np.asarray(world_from_cams, np.float64).reshape(-1, 4, 4)
     poses = poses[np.isfinite(poses).all(axis=(1, 2))]
     poses = poses[_evenly(len(poses), MAX_IMAGES)]
-    if not len(poses) or _look_down_z(poses[:, :3, :3]):
+    if not len(poses) or look_down_z(poses[:, :3, :3]):
         return np.array([0.0, 0.0, 1.0])
     return _most_upright(poses[:, :3, :3], poses[:, :3, 3], np.zeros(len(poses), np.int64))[0]
 
 
-def _look_down_z(axes: Floats) -> bool:
-    """Tell whether cameras with these axes (N, 3, 3) all look along -z, so that level axes tell nothing."""
+def look_down_z(axes: Floats) -> bool:
+    """Tell whether cameras with these axes (N, 3, 3) or poses (N, 4, 4) look along -z: level axes then tell nothing."""
     along = -axes[:, 2, 2]
     return bool(len(axes) > 2 and np.quantile(along, 0.1) > np.cos(NADIR))
 

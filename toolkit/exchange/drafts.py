@@ -44,7 +44,7 @@ from toolkit.capture.images import (
 from toolkit.capture.names import EXPECTED_NAME, SPLITS, has_long_part, is_bad_name, is_linked_here, note_linked_here
 from toolkit.capture.session import IMPORT_RECORD
 from toolkit.capture.tables import COLUMNS, read_depth, write_depth, write_table
-from toolkit.capture.upright import up_of_cameras
+from toolkit.capture.upright import look_down_z, up_of_cameras
 from toolkit.errors import CaptureError, ImageError, ManifestError
 from toolkit.exchange.georeference import alignment, gps_position, quarter_turns, read_positions
 from toolkit.exchange.import_report import ImportReport, cameras_of, grouped
@@ -492,7 +492,8 @@ class Draft(Options):
         table = pd.DataFrame(self.rows, columns=columns).astype({"timestamp": "Int64"})
         posed = list(self._camera_poses(self.images[:: max(1, len(self.images) // _MOST_FOR_UP)]).values())
         axis = ", ".join(f"{value + 0.0:.2f}" for value in up_of_cameras(posed))
-        by = f"z, {self.record['up']}" if "up" in self.record else f"({axis}), as most cameras are held"
+        how = "a guess: all look along -z" if look_down_z(np.reshape(posed, (-1, 4, 4))) else "as most cameras are held"
+        by = f"z, {self.record['up']}" if "up" in self.record else f"({axis}), {how}"
         record = {
             "unit": self.record.get("unit", "m"), "source": str(self.folder), "used": len(self.images),
             "seen": len(self.images) + len(left_out),

@@ -78,7 +78,7 @@ with most matches may be one that fits the bent part. Of 522 poses in maps with 
 probable."""
 
 # Of the search for the pose
-PNP_FORMAT = 12
+PNP_FORMAT = 13
 """Version of the poses. Increase when the same settings and files give other poses, or they are written otherwise."""
 FIRST_REFERENCES = {2: 200, 4: 100}
 """Number of references per image to match first -> independent inliers that their pose needs to be kept. The next
