@@ -74,10 +74,12 @@ browser-setup: $(INSTALLED)  ## install Chromium (apt, with sudo if not root) an
 test-browser: $(INSTALLED)  ## test the report and the notebooks' viewer in a browser; first: make browser-setup
 	$(BIN)/python -m pytest -m browser -rs
 
+# These wait for kernels, browsers and processes: on 2 cores, 3 workers take 14:02 minutes and 9.8 GB, 2 workers 15:00.
+ONE_MORE := import psutil; cores = psutil.cpu_count(); print(min(cores + (psutil.virtual_memory().total > 12e9), 4))
 test-rest: $(INSTALLED)  ## run the browser tests and the slow tests together; they share a finished run
 	@$(MAKE) --no-print-directory $(VENV)/.installed-fuzz || \
 	  echo "The fuzzers cannot be installed here: their tests are skipped."
-	$(PYTEST) -m "browser or slow" -rs
+	$(PYTEST) -n $$($(BIN)/python -c '$(ONE_MORE)') -m "browser or slow" -rs
 
 docs-setup: $(INSTALLED)  ## install the tools that build the documentation (pip)
 	@$(MAKE) --no-print-directory $(VENV)/.installed-docs || \

@@ -36,9 +36,12 @@ def pytest_collection_finish() -> None:
 
 
 LONGEST = (
-    "pages", "accuracy", "kills", "doors", "lineage", "panoramas", "properties", "notebooks", "localize", "threads",
+    "doors", "accuracy", "pages", "notebooks", "kills", "fuzz", "localize", "viewer", "retrieve", "lineage", "package",
+    "sequence", "cluster", "lab_page", "panoramas", "properties", "own_photograph", "own_images", "vggt", "refinement",
+    "camera_models", "site", "report_page", "threads",
 )  # fmt: skip
-"""Modules `test_<name>.py` that would leave a worker alone if they were the last; those that take longest first."""
+"""Modules `test_<name>.py` that would leave a worker alone if they were the last; those that take longest first, but
+notebooks wait for a run that doors make."""
 
 
 @pytest.hookimpl(trylast=True)

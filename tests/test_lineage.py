@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.rendered import copy_linked
+from tests.unattended import no_kernels
 from toolkit import notebook, pipeline
 from toolkit.errors import COMMAND, ArtifactError, ManifestError
 from toolkit.evaluate import evaluate_scene
@@ -372,7 +373,8 @@ def test_what_only_left_out_says_older_and_the_next_run_mends_it(linked: SceneFi
     manifest.write_text(f"captures: ['{small_capture}']\noutput_root: .\n")
     common = ["visualize.samples=1", "visualize.recordings=false", "visualize.session_recordings=false"]
     nearest = [*common, "localize.method=nearest"]
-    pipeline.run(manifest, only="localize", overrides=nearest, say=quiet, in_place=True)
+    with no_kernels():
+        pipeline.run(manifest, only="localize", overrides=nearest, say=quiet, in_place=True)
     rows = {row["stage"]: row for row in json.loads((linked.run / "run.json").read_text())["stages"]}
     assert {stage: row["status"] for stage, row in rows.items()} == {
         **dict.fromkeys(("explore", "embed", "retrieve"), "reused"), "localize": "done",
@@ -381,7 +383,8 @@ def test_what_only_left_out_says_older_and_the_next_run_mends_it(linked: SceneFi
     assert "run the evaluate stage again" in rows["evaluate"]["reason"]
     page = (linked.run / "report.html").read_text()
     assert "mean recall" not in page
-    pipeline.run(manifest, overrides=nearest, say=quiet, in_place=True)
+    with no_kernels():
+        pipeline.run(manifest, overrides=nearest, say=quiet, in_place=True)
     rows = {row["stage"]: row["status"] for row in json.loads((linked.run / "run.json").read_text())["stages"]}
     assert (rows["evaluate"], rows["visualize"]) == ("done", "done")
     assert "mean recall" in (linked.run / "report.html").read_text()
@@ -409,7 +412,8 @@ def test_a_run_with_other_settings_leaves_the_finished_one_as_it_is(linked: Scen
     manifest = linked.run.parent / f"{linked.run.name}.yaml"
     manifest.write_text(f"captures: ['{small_capture}']\noutput_root: .\n")
     before = {path: file_fingerprint(path) for path in linked.run.rglob("*") if path.is_file()}
-    run = pipeline.run(manifest, only="localize", overrides=["localize.method=nearest"], say=quiet)
+    with no_kernels():
+        run = pipeline.run(manifest, only="localize", overrides=["localize.method=nearest"], say=quiet)
     assert run.name == f"{linked.run.name}-method-nearest"
     assert {path: file_fingerprint(path) for path in linked.run.rglob("*") if path.is_file()} == before
     taken = SceneFiles(run, "SMALL")

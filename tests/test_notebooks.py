@@ -17,9 +17,11 @@ from urllib.parse import unquote
 import nbformat
 import pandas as pd
 import pytest
+from typer.testing import CliRunner
 
 from tests.unattended import no_kernels
 from toolkit import notebook, pipeline
+from toolkit.__main__ import app
 from toolkit.errors import ArtifactError, ManifestError, StageError
 from toolkit.manifest import OPTIONAL, STAGES, Manifest, RerankSettings, RetrieveSettings
 from toolkit.notebook import StatusLine, notebook_parameters, notebook_path
@@ -123,14 +125,14 @@ BY_HAND: dict[str, dict[str, Any]] = {
     "retrieve": {"topk": 2},
     "rerank": {"topn": 5, "topk": 3},
     "localize": {"method": "nearest"},
-    "sequence": {"position_drift": 0.1},
+    "sequence": {"position_drift": 0.1, "map_device": "hl"},
     "evaluate": {"thresholds": [[2, 0.2]]},
-    "visualize": {"samples": 0},
+    "visualize": {"samples": 0, "map_device": "hl"},
     "own_images": {"device": "own"},
     "compare": {"pictures": 1},
     "start": {"map_device": "hl"},
 }
-"""Notebooks, and a parameter that is not as in the run."""
+"""Notebooks, and a parameter that is not as in the run; one map is enough where all take long."""
 
 
 @pytest.mark.slow
@@ -451,16 +453,18 @@ def test_a_capture_without_truth_has_a_report_too(small_capture: Path, small_run
 
 
 @pytest.mark.slow
-def test_a_run_with_all_stages_is_reused(small_capture: Path, small_run: Path, tmp_path: Path) -> None:
+def test_a_run_with_all_stages_is_reused(
+    small_capture: Path, small_run: Path, tmp_path: Path, released_weights: None
+) -> None:
     manifest = tmp_path / "small.yaml"
     sections = "rerank: {}\nsequence: {}\nvisualize: {samples: 1, session_recordings: false}\n"
     manifest.write_text(f"captures: ['{small_capture}']\noutput_root: runs\n{sections}")
     run = tmp_path / "runs" / "small"
     # What the stages have made is taken over, but for what reranking changes.
     shutil.copytree(small_run / "SMALL", run / "SMALL", ignore=shutil.ignore_patterns(".stages"))
-    command = [sys.executable, "-m", "toolkit", "run", str(manifest)]
-    first = subprocess.run(command, capture_output=True, text=True)
-    assert first.returncode == 0, first.stdout + first.stderr
+    with no_kernels():  # the optional notebooks have them in the test by hand, the others in the small run
+        first = CliRunner().invoke(app, ["run", str(manifest)])
+    assert first.exit_code == 0, first.output
     rows = {row["stage"]: row for row in json.loads((run / "run.json").read_text())["stages"]}
     assert list(rows) == list(STAGES)
     assert rows["retrieve"]["parameters"]["settings"]["topk"] == 30
@@ -476,8 +480,8 @@ def test_a_run_with_all_stages_is_reused(small_capture: Path, small_run: Path, t
     assert len(list((run / "SMALL" / "visualization").glob("*_sequence.png"))) == 9
     assert len(list((run / "SMALL" / "poses").glob("*.txt"))) == 18
 
-    again = subprocess.run(command, capture_output=True, text=True)
-    assert again.stdout.count("reused") == len(STAGES), again.stdout + again.stderr
+    again = CliRunner().invoke(app, ["run", str(manifest)])
+    assert again.stdout.count("reused") == len(STAGES), again.output
 
 
 def test_a_table_on_a_page_has_medians_first_and_says_nothing_twice() -> None:

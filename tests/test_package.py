@@ -116,7 +116,7 @@ def test_a_wheel_runs_the_demo_in_an_empty_folder(tmp_path: Path) -> None:
         return ended.stdout
 
     assert __version__ in visloc("--version")
-    small = ["demo_data.rooms=1", "demo_data.frames=8", "demo_data.hard=false", "devices=[ios]"]
+    small = ["demo_data.rooms=1", "demo_data.frames=6", "demo_data.hard=false", "devices=[ios]"]
     told = visloc("run", "demo", "--in-place", *(part for one in small for part in ("--set", one)))
     assert "Report: " in told
     assert (place / "runs" / "demo" / "report.html").is_file()

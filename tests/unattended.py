@@ -76,9 +76,9 @@ def execute_cells(
     content = nbformat.read(path, as_version=4)
     outputs: list[Any] = []
 
-    def display(data: Any = None, raw: bool = False, **_: Any) -> None:
+    def display(*data: Any, raw: bool = False, **_: Any) -> None:
         if raw:
-            outputs.append(new_output("display_data", data=data))
+            outputs.extend(new_output("display_data", data=one) for one in data)
 
     IPython.display.display = display
     variables: dict[str, Any] = {"display": display}

@@ -135,6 +135,22 @@ def test_other_absurd_intrinsics_are_doubted(camera: pycolmap.Camera) -> None:
     assert pose is None or (misfit is not None and misfit.doubtful)
 
 
+def test_another_camera_with_more_inliers_all_over_the_same_image_is_no_misfit() -> None:
+    """By night, where windows repeat, few matches are right, and more may fit another camera and pose."""
+    rng = np.random.default_rng(0)
+    right, points = scene(rng, np.eye(4)[None], 100, (4.0, 15.0))
+    xy = rng.uniform(0, (960, 640), (130, 2))
+    rays = np.column_stack([(xy - (480, 320)) / 3840, np.ones(130)])
+    repeated = geometry.transform(TURNED, rays * rng.uniform(4, 15, (130, 1)))
+    strays = rng.uniform(0, (960, 640), (320, 2))
+    pixels = np.concatenate([right.pixels, xy + rng.normal(0, 0.7, xy.shape), strays])
+    points = np.concatenate([points, repeated, rng.uniform(-5, 15, (320, 3))])
+    matches = Matches(np.zeros(len(pixels), np.int64), pixels, np.arange(len(pixels)))
+    query = RigQuery([TRUE], np.eye(4)[None], [[]])
+    pose = query.refine(np.eye(4), matches[np.arange(20, 100)], points)
+    assert find_misfit(query, pose, matches, points, MAX_ERROR_DEG) is None
+
+
 def test_errors_that_neighbors_share_do_not_look_like_a_wrong_camera() -> None:
     """A rolling shutter moves each row of the image by another amount: for a moment, it looks like other intrinsics."""
     doubted = 0

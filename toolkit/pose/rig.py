@@ -77,7 +77,11 @@ SETTLED_PX = 0.02  # largest motion of a projection in a step at which the fit h
 MIN_SCALE_PX = 0.5  # least scale of the Cauchy weights
 PRIOR_STD = (0.2, 0.02, 0.02, 0.05)  # prior standard deviations of the four `Misfit.parameters`
 FOCALS = (0.45, 0.7, 1.1, 1.7, 2.6, 4.0)  # focal lengths of the cameras to try, over the longer side of the image
-MORE = 1.5  # such a camera fits if it has this many times the inliers of the stated one
+MORE = 3.0
+"""Such a camera fits if its odds of an inlier, times the cells that have one, are so many times those of the stated.
+A wrong camera fits a part of the image: where focal lengths, distortions or principal points are absurd, or images are
+cropped off-center, the ratio is 4.5 and more; of right cameras by night, where windows repeat, at most 2.6."""
+LEAST = 12  # its inliers must be more than these
 FEW = 0.3  # share of inliers among the matches below which other cameras are tried if the first step is certain
 VERY_FEW = 0.2  # share below which they are tried in any case
 TRIALS = 1000  # samples of their RANSAC
@@ -468,7 +472,7 @@ def find_misfit(
         return None
     fitted = problem.fit(start, free)
     if share < VERY_FEW or (by_chance < CERTAIN and (fitted is None or problem.inliers(fitted).mean() < FEW)):
-        other = _try_cameras(problem, start, int(problem.inliers(fitted or start).sum()))
+        other = _try_cameras(problem, start, problem.inliers(fitted or start))
         if other is not None:
             return other
     if fitted is None or by_chance > SUSPICIOUS:
@@ -477,16 +481,21 @@ def find_misfit(
     return problem.misfit(start, fitted, free, float(np.tan(np.radians(noise_deg)) * query.focals_px.mean()))
 
 
-def _try_cameras(stated: "_Problem", start: "_Estimate", inliers: int) -> Misfit | None:
+def _try_cameras(stated: "_Problem", start: "_Estimate", inliers: Bools) -> Misfit | None:
     """Return the misfit of stated cameras to which others are clearly preferable; None if there are no such others.
 
     The others have the principal point in the center of the image and, to start with, no distortion.
 
     Args:
         stated, start: the matches with the stated cameras, and the pose found with them.
-        inliers: number of inliers of the stated cameras, with small changes of the intrinsics.
+        inliers: (K,) whether matches are inliers of the stated cameras, with small changes of the intrinsics.
     """
-    best, misfit = max(MORE * inliers, 12.0), None
+
+    def fit_of(inliers: Bools) -> float:
+        """Return the odds of an inlier, times the cells that have one."""
+        return stated.query.num_cells(stated.matches[inliers]) * int(inliers.sum()) / max(int((~inliers).sum()), 1)
+
+    best, misfit = MORE * fit_of(inliers), None
     for share in FOCALS:
         cameras = [_simple(camera, share) for camera in stated.query.cameras]
         query = RigQuery(cameras, stated.query.rig_from_cams, [[] for _ in cameras])
@@ -495,8 +504,8 @@ def _try_cameras(stated: "_Problem", start: "_Estimate", inliers: int) -> Misfit
             continue
         problem = _Problem(query, stated.matches, stated.points, stated.max_error_deg)
         fitted = problem.fit(_Estimate(pose, np.zeros(problem.unknowns - 6)), ~np.zeros(problem.unknowns, bool))
-        if fitted is not None and problem.inliers(fitted).sum() > best:
-            best = float(problem.inliers(fitted).sum())
+        if fitted is not None and (found := problem.inliers(fitted)).sum() > LEAST and fit_of(found) > best:
+            best = fit_of(found)
             changes = np.array(list(map(_change, stated.query.cameras, cameras, fitted.parameters.reshape(-1, 4))))
             # If it is nearly the stated camera, the fit will tell.
             focal, right, down, distortion = changes.T  # and how far they move pixels, relatively
