@@ -41,8 +41,8 @@ from toolkit.geometry import Ints
 from toolkit.manifest import LocalizeSettings
 from toolkit.mapping.build import map_settings
 from toolkit.pose.base import Query, QueryInput, QueryResult, References, status_counts
+from toolkit.pose.map_matching import MAX_SHARES, SIGNIFICANCE
 from toolkit.pose.pnp import PNP_FORMAT
-from toolkit.pose.rig import MAX_SHARES, SIGNIFICANCE
 from toolkit.prediction.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.prediction.hybrid import lifts
 from toolkit.prediction.network import open_predictor

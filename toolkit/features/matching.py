@@ -19,7 +19,6 @@ from scipy.special import gammaln
 from toolkit.errors import ManifestError
 from toolkit.features import features as feature_types
 from toolkit.features.features import Extractor, LocalFeatures, MutualMatcher, PairMatches, two_best
-from toolkit.features.features import unit_descriptors as unit_descriptors
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import AUTO, LocalizeSettings, RerankSettings, checkpoint_of, nearest
 from toolkit.models import weights

@@ -58,10 +58,10 @@ from toolkit.pose.base import (
     agree,
 )  # fmt: skip
 from toolkit.pose.local_triangulation import OnDemandLocalizer, PosedImages
-from toolkit.pose.map_matching import CACHED_IMAGES, MappedFeatures
+from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import RIVAL_DISTANCE, PnpLocalizer, bounded_by_rivals, clarity_of_support
 from toolkit.prediction.feed_forward import FeedForwardLocalizer, depth_of_images
-from toolkit.prediction.hybrid import HybridLocalizer, LiftingLocalizer, lifts
+from toolkit.prediction.hybrid import MOST_FEATURES, DepthLifter, HybridLocalizer, lifts
 from toolkit.prediction.interface import Predictor
 from toolkit.prediction.network import open_predictor
 from toolkit.results.metrics import UNKNOWN_UNIT, length_unit
@@ -540,25 +540,19 @@ class Map:
             )
         pnp = PnpLocalizer(self.in_lengths, settings.pnp, settings.seed)
         if settings.method != "feed_forward":
-            self._read_features()
+            for kind in self.in_lengths:
+                kind.load()
         if not settings.predicts:
-            of_image = depth_of_images(self.session, pnp.image_names, self.length)
-            return LiftingLocalizer(pnp, of_image) if lifts(settings, self.session) else pnp
+            if lifts(settings, self.session):
+                of_image = depth_of_images(self.session, pnp.image_names, self.length)
+                pnp.lift = DepthLifter(pnp, of_image, MOST_FEATURES).localize
+            return pnp
         predictor = self.predictor or open_predictor(settings, self.capture, self.map_dir)
         unit = ("m", 1 / self.length) if self.settings.unit else (UNKNOWN_UNIT, 1.0)
         feed_forward = FeedForwardLocalizer(
             self.in_lengths[0].map, self.session, predictor, settings.predictor, self.turns, self.length, unit
         )
         return feed_forward if settings.method == "feed_forward" else HybridLocalizer(pnp, feed_forward)
-
-    @fixed_sums
-    def _read_features(self) -> None:
-        """Read the features of the map images, if the cache holds all of them: 1 ms for each."""
-        for kind in self.in_lengths:
-            names = kind.map.image_names
-            for index in range(len(names)) if len(names) <= CACHED_IMAGES else ():
-                if names[index] in kind.features:
-                    kind.image(index)
 
     @cached_property
     def fallback(self) -> Localizer | None:
