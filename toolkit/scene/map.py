@@ -2,9 +2,8 @@
 
 import copy
 import logging
-import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from html import escape
@@ -20,7 +19,7 @@ from toolkit.capture.images import thumbnails, turn_image
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_folders, open_descriptors, shows_upright
 from toolkit.embedders.search import VectorIndex, embedder_fingerprint, fuse, load_index, search
-from toolkit.errors import COMMAND, ArtifactError, ManifestError
+from toolkit.errors import ArtifactError
 from toolkit.features.features import KINDS, SiftExtractor, usable
 from toolkit.features.matching import (
     AnyMethod,
@@ -30,13 +29,11 @@ from toolkit.features.matching import (
     create_local_methods,
     create_methods,
     needs_upright,
-    resolve_auto,
 )
 from toolkit.features.stores import FeatureStore, OnDemandFeatures, extract_session
 from toolkit.files import RAW_DATA, SceneFiles, image_name, require_current
 from toolkit.geometry import Floats, Ints, unit
 from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings
-from toolkit.manifest.settings import expand
 from toolkit.mapping.build import build_map
 from toolkit.mapping.local_map import Consistency, LocalMap, map_path
 from toolkit.mapping.pose_consistency import NOMINAL_DEPTH, remarks
@@ -77,7 +74,7 @@ from toolkit.results.pair import (
     pairs_in_map,
     read_settings,
 )  # fmt: skip
-from toolkit.scene.query import answer_of, query_from, show_matches, what_if
+from toolkit.scene.query import answer_of, query_from, show_matches, what_if, with_changes
 from toolkit.threads import fixed_sums
 
 if TYPE_CHECKING:
@@ -90,8 +87,6 @@ log = logging.getLogger(__name__)
 
 WITHOUT_FEATURES = ("feed_forward", "nearest")
 """Methods that need no local features of the queries."""
-FIXED_BY_MAP = ("unit", "world_up")
-"""Settings that the length of the map and the turns of its images depend on, so they cannot change for a query."""
 NEAR, NEAR_DEG = 10.0, 60.0
 """Largest distance (in map lengths, see `Survey.length`) and angle (degrees) between a camera and a map image that may
 show the same scene."""
@@ -584,50 +579,7 @@ class Map:
             settings.seed,
         )
 
-    def changed(self, changes: Mapping[str, Any]) -> "Map":
-        """Return the map with changed settings of the localize stage; it shares what stays the same with this one.
-
-        If features, or the settings of the map's points, change, points are triangulated for each query from its
-        references, as the map has none of this kind.
-
-        Raises:
-            ManifestError: a setting is unknown, or the unit or the up direction of the map would change.
-            WeightsError: a network of the changed settings has no weights.
-        """
-        before, changes = self.settings, expand(LocalizeSettings, changes)
-        features = changes.get("features", {})
-        if "kinds" in features and "escalation" not in features:
-            rest = [name for name in before.features.escalation if name not in features["kinds"]]
-            changes |= {"features": {**features, "escalation": rest}}
-        try:
-            settings = LocalizeSettings.of(before, changes)
-        except ManifestError as error:
-            raise ManifestError(re.sub(r"^\w+:\s+", "localize: ", str(error))) from None
-        if fixed := [name for name in FIXED_BY_MAP if getattr(settings, name) != getattr(before, name)]:
-            raise ManifestError(
-                f"localize.{fixed[0]}: cannot change for one query, as the whole map depends on it. "
-                f"To change it: {COMMAND} run MANIFEST --set localize.{fixed[0]}=..."
-            )
-        other = copy.copy(self)
-        other.settings, other.original = settings, self._first
-        for name in ("localizer", "fallback", "index_of", "in_lengths", "points", "_world_from_cams"):
-            other.__dict__.pop(name, None)
-        if settings.map != before.map and not settings.predicts:
-            other.mapped = []
-        anew = settings.features != before.features or settings.matcher != before.matcher
-        if anew or not self.kinds:
-            kinds, other.escalation = create_methods(resolve_auto(settings))
-            extracted = {kind.name: kind.extractor.settings for kind in self.kinds}
-            kept = {kind.name: kind for kind in kinds if extracted.get(kind.name) == kind.extractor.settings}
-            other.mapped = [
-                MappedFeatures(kind.map, kind.features, kind.name, kept[kind.name].matcher)
-                for kind in other.mapped
-                if kind.name in kept
-            ]
-            mapped = [kind.name for kind in other.mapped]
-            other.kinds = sorted(kinds, key=lambda kind: kind.name not in mapped)  # as `OnDemandLocalizer` wants them
-            other.__dict__.pop("_on_demand", None)
-        return other
+    changed = with_changes
 
     @cached_property
     def search(self) -> "ReferenceSearch":

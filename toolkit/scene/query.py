@@ -2,7 +2,9 @@
 themselves, and to be tried with changes.
 """
 
+import copy
 import operator
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,10 +26,13 @@ from toolkit.capture.images import (
     stored_size,
 )
 from toolkit.errors import COMMAND, ArtifactError, CameraError, ImageError, ManifestError
+from toolkit.features.matching import create_methods, resolve_auto
 from toolkit.geometry import Floats
-from toolkit.manifest import nearest
+from toolkit.manifest import LocalizeSettings, nearest
 from toolkit.manifest.manifest import nested
+from toolkit.manifest.settings import expand
 from toolkit.pose.base import Query, QueryMatches, QueryResult, References, RoughPose, View
+from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpMatches
 from toolkit.results.localized import ShownImage
 from toolkit.results.metrics import is_posed, length_unit
@@ -44,6 +49,8 @@ Image = Any
 """A file (str, Path), or pixels as `pixels_from` takes them."""
 Map = Any
 """A `scene.map.Map`, which imports this module."""
+FIXED_BY_MAP = ("unit", "world_up")
+"""Settings that the length of the map and the turns of its images depend on, so they cannot change for a query."""
 CHANGEABLE = ("localize", "retrieve.topk")
 """Sections and keys of a manifest that can be changed for one query."""
 
@@ -285,6 +292,52 @@ def what_if(
     before, retrieved = result.show(), ranks(scene_map, found)
     after = replace(before, result=again, settings=other.settings, views=query.views, retrieved=retrieved)
     return Comparison(before, after, {**changes, **{name: value for name, value in said.items() if value}})
+
+
+def with_changes(scene_map: Map, changes: Mapping[str, Any]) -> Map:
+    """Return a map with changed settings of the localize stage; it shares what stays the same with the given one.
+
+    If features, or the settings of the map's points, change, points are triangulated for each query from its
+    references, as the map has none of this kind.
+
+    Raises:
+        ManifestError: a setting is unknown, or the unit or the up direction of the map would change.
+        WeightsError: a network of the changed settings has no weights.
+    """
+    before, changes = scene_map.settings, expand(LocalizeSettings, changes)
+    features = changes.get("features", {})
+    if "kinds" in features and "escalation" not in features:
+        rest = [name for name in before.features.escalation if name not in features["kinds"]]
+        changes |= {"features": {**features, "escalation": rest}}
+    try:
+        settings = LocalizeSettings.of(before, changes)
+    except ManifestError as error:
+        raise ManifestError(re.sub(r"^\w+:\s+", "localize: ", str(error))) from None
+    if fixed := [name for name in FIXED_BY_MAP if getattr(settings, name) != getattr(before, name)]:
+        raise ManifestError(
+            f"localize.{fixed[0]}: cannot change for one query, as the whole map depends on it. "
+            f"To change it: {COMMAND} run MANIFEST --set localize.{fixed[0]}=..."
+        )
+    other = copy.copy(scene_map)
+    other.settings, other.original = settings, scene_map._first
+    for name in ("localizer", "fallback", "index_of", "in_lengths", "points", "_world_from_cams"):
+        other.__dict__.pop(name, None)
+    if settings.map != before.map and not settings.predicts:
+        other.mapped = []
+    anew = settings.features != before.features or settings.matcher != before.matcher
+    if anew or not scene_map.kinds:
+        kinds, other.escalation = create_methods(resolve_auto(settings))
+        extracted = {kind.name: kind.extractor.settings for kind in scene_map.kinds}
+        kept = {kind.name: kind for kind in kinds if extracted.get(kind.name) == kind.extractor.settings}
+        other.mapped = [
+            MappedFeatures(kind.map, kind.features, kind.name, kept[kind.name].matcher)
+            for kind in other.mapped
+            if kind.name in kept
+        ]
+        mapped = [kind.name for kind in other.mapped]
+        other.kinds = sorted(kinds, key=lambda kind: kind.name not in mapped)  # as `OnDemandLocalizer` wants them
+        other.__dict__.pop("_on_demand", None)
+    return other
 
 
 def answer_of(scene_map: Map, query: Query, references: Sequence[References], result: QueryResult) -> "Answer":
