@@ -35,8 +35,8 @@ from toolkit.embed import embed_sessions
 from toolkit.embedders import EMBEDDERS
 from toolkit.errors import ArtifactError, CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.evaluate import evaluate_scene
-from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor, SiftSettings
-from toolkit.features.matching import MATCHERS, LocalMethod, MutualMatcher, unit_descriptors
+from toolkit.features.features import KINDS, LocalFeatures, MutualMatcher, SiftExtractor, SiftSettings, unit_descriptors
+from toolkit.features.matching import MATCHERS, LocalMethod
 from toolkit.features.stores import extract_session
 from toolkit.figures import top_view
 from toolkit.files import SceneFiles, image_name, map_record_path, read_map_record, read_references, sidecar_path
@@ -65,7 +65,6 @@ from toolkit.results.localized import sure_points
 from toolkit.results.pair import PairResults
 from toolkit.retrieve import load_embeddings, retrieve_pairs
 from toolkit.scene import map as maps
-from toolkit.scene import query as search
 from toolkit.scene.query import pixels_from
 from toolkit.scene.run import InspectedPair
 from toolkit.sequence import sequence_pairs
@@ -1595,12 +1594,11 @@ def test_threads_that_localize_again_have_nothing_to_load(
     opened: list[Map] = []
     open_map = Map.open
     monkeypatch.setattr(Map, "open", lambda *run: opened.append(open_map(*run)) or opened[-1])
-    loaders = {maps: ["PnpLocalizer", "upright_turns"], search: ["create_embedder", "open_descriptors", "load_index"]}
+    loaders = ["PnpLocalizer", "upright_turns", "create_embedder", "open_descriptors", "load_index"]
 
     def in_threads(localize: Callable[[int], QueryResult], numbers: range, _: int) -> list[QueryResult]:
-        for module, names in loaders.items():
-            for name in names:
-                monkeypatch.setattr(module, name, Mock(side_effect=AssertionError(name)))
+        for name in loaders:
+            monkeypatch.setattr(maps, name, Mock(side_effect=AssertionError(name)))
         assert all("_method" in vars(kind) for kind in opened[0].escalation)
         return [localize(number) for number in numbers]
 

@@ -19,8 +19,8 @@ from toolkit.capture import Capture, Trajectory
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.evaluate import overlap_table
 from toolkit.features import matching as verification
-from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor
-from toolkit.features.matching import LocalMethod, MutualMatcher, is_meaningful, verified_matches
+from toolkit.features.features import KINDS, LocalFeatures, MutualMatcher, SiftExtractor
+from toolkit.features.matching import LocalMethod, is_meaningful, verified_matches
 from toolkit.files import SceneFiles, read_references, sidecar_path
 from toolkit.geometry import invert, make_pose, transform
 from toolkit.manifest import RerankSettings

@@ -79,8 +79,7 @@ import hashlib
 import cv2, numpy as np
 from threadpoolctl import threadpool_limits
 from toolkit.embedders import vlad
-from toolkit.features.features import KINDS
-from toolkit.features.matching import MutualMatcher
+from toolkit.features.features import KINDS, MutualMatcher
 from toolkit.features.features import SiftExtractor
 
 vlad.MAX_WORDS = 32

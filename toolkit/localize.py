@@ -18,7 +18,8 @@ from toolkit.capture.images import default_workers, prefetch
 from toolkit.capture.tables import POSES_UNIT, in_unit_of_poses, read_query_table
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import ToolkitError, reason_of
-from toolkit.features.matching import AnyMethod, MutualMatcher, resolve_auto, weights_files
+from toolkit.features.features import MutualMatcher
+from toolkit.features.matching import AnyMethod, create_methods, needs_upright, resolve_auto, weights_files
 from toolkit.features.stores import FeatureStore, extract_session, match_sessions
 from toolkit.files import (
     Remade,
@@ -40,8 +41,8 @@ from toolkit.geometry import Ints
 from toolkit.manifest import LocalizeSettings
 from toolkit.mapping.build import map_settings
 from toolkit.pose.base import Query, QueryInput, QueryResult, References, status_counts
+from toolkit.pose.map_matching import MAX_SHARES, SIGNIFICANCE
 from toolkit.pose.pnp import PNP_FORMAT
-from toolkit.pose.rig import MAX_SHARES, SIGNIFICANCE
 from toolkit.prediction.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
 from toolkit.prediction.hybrid import lifts
 from toolkit.prediction.network import open_predictor
@@ -55,7 +56,8 @@ from toolkit.results.pair import (
     update_attributes,
 )
 from toolkit.runs.pairs import PairRows
-from toolkit.scene.map import FEW_REFERENCES, WITHOUT_FEATURES, Map, create_methods, localize_image, needs_upright
+from toolkit.scene.images import localize_image
+from toolkit.scene.map import FEW_REFERENCES, WITHOUT_FEATURES, Map
 from toolkit.scene.run import StoredQueries
 from toolkit.store.hdf5 import write_groups
 from toolkit.store.items import Items, heals

@@ -15,8 +15,7 @@ from toolkit.__main__ import app
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError
 from toolkit.exchange.export import export_features, export_matches, import_features, import_matches
-from toolkit.features.features import LocalFeatures
-from toolkit.features.matching import MutualMatcher, PairMatches, unit_descriptors
+from toolkit.features.features import LocalFeatures, MutualMatcher, PairMatches, unit_descriptors
 from toolkit.features.stores import (
     FeatureStore,
     MatchStore,

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
-from toolkit.features.features import LocalFeatures
-from toolkit.features.matching import PairMatches
+from toolkit.features.features import LocalFeatures, PairMatches
 from toolkit.features.network import LightGlueMatcher, _pack
 
 transformers = pytest.importorskip("transformers", reason="needs the extra `learned`")

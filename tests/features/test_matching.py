@@ -8,15 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
 from toolkit.errors import ManifestError
-from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures
-from toolkit.features.matching import (
-    MutualMatcher,
-    create_matcher,
-    match_along_epipolar_lines,
-    matchers_of,
-    mutual_matches,
-    unit_descriptors,
-)
+from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures, MutualMatcher, mutual_matches, unit_descriptors
+from toolkit.features.matching import create_matcher, match_along_epipolar_lines, matchers_of
 
 Floats = NDArray[np.float64]
 

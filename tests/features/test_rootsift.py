@@ -3,8 +3,7 @@
 import numpy as np
 
 from toolkit.features import features as rootsift
-from toolkit.features.features import KINDS, LENGTH, STEP, rootsift_64
-from toolkit.features.matching import MutualMatcher
+from toolkit.features.features import KINDS, LENGTH, STEP, MutualMatcher, rootsift_64
 
 
 def test_shortened_descriptors_have_length_1_and_none_at_all_stays_zero() -> None:

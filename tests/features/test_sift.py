@@ -16,9 +16,10 @@ from toolkit.features.features import (
     LocalFeatures,
     SiftExtractor,
     SiftSettings,
+    mutual_matches,
     stretch_contrast,
+    unit_descriptors,
 )
-from toolkit.features.matching import mutual_matches, unit_descriptors
 
 Described = tuple[NDArray[np.float32], NDArray[np.float32]]
 """Keypoints (N, 2) and unit descriptors (N, D)."""

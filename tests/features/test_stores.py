@@ -19,11 +19,7 @@ from toolkit.capture import Session, write_session
 from toolkit.capture.images import read_image
 from toolkit.errors import ArtifactError
 from toolkit.features import stores
-from toolkit.features.features import LocalFeatures, SiftExtractor, SiftSettings
-from toolkit.features.matching import (
-    MutualMatcher,
-    PairMatches,
-)
+from toolkit.features.features import LocalFeatures, MutualMatcher, PairMatches, SiftExtractor, SiftSettings
 from toolkit.features.stores import (
     FeatureStore,
     MatchStore,

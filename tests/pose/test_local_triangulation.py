@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from tests.queries import indices_of, query_of
 from toolkit import geometry
-from toolkit.features.features import KINDS, LocalFeatures
-from toolkit.features.matching import LocalMethod, Matcher, MutualMatcher, PairMatches
+from toolkit.features.features import KINDS, LocalFeatures, MutualMatcher, PairMatches
+from toolkit.features.matching import LocalMethod, Matcher
 from toolkit.mapping.local_map import LocalMap
 from toolkit.pose.base import QueryResult, References
 from toolkit.pose.local_triangulation import OnDemandLocalizer, PosedImages

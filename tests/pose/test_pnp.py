@@ -14,13 +14,19 @@ from scipy.spatial.transform import Rotation
 
 from tests.queries import ask, indices_of, rests_on
 from toolkit import geometry
-from toolkit.features.features import DESCRIPTOR_SCALE, KINDS, LocalFeatures
-from toolkit.features.matching import MutualMatcher, PairMatches, unit_descriptors
+from toolkit.features.features import (
+    DESCRIPTOR_SCALE,
+    KINDS,
+    LocalFeatures,
+    MutualMatcher,
+    PairMatches,
+    unit_descriptors,
+)
 from toolkit.manifest import PnpSettings
 from toolkit.mapping.local_map import Consistency, LocalMap
 from toolkit.pose import map_matching as matches
 from toolkit.pose import pnp
-from toolkit.pose.base import CAMERA, NOISE, Prior, QueryResult, References, Status
+from toolkit.pose.base import CAMERA, NOISE, Matches, Prior, QueryResult, References, RigQuery, Status
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import (
     FIRST_REFERENCES,
@@ -30,8 +36,8 @@ from toolkit.pose.pnp import (
     _Hypothesis,
     _relative_support,
     _support,
+    least_squares_covariance,
 )
-from toolkit.pose.rig import Matches, RigQuery, least_squares_covariance
 
 Floats = NDArray[np.float64]
 SIZE_M = 0.02  # standard deviation of each point's blob on its surface

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
-from toolkit.pose.rig import Matches, RigQuery
+from toolkit.pose.base import Matches, RigQuery
 
 SIZE = {"width": 960, "height": 640}
 CAMERAS = [

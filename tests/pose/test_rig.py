@@ -6,7 +6,8 @@ import pytest
 from numpy.typing import NDArray
 
 from toolkit import geometry
-from toolkit.pose.rig import MAX_SHARES, Matches, Misfit, RigQuery, find_misfit
+from toolkit.pose.base import Matches, RigQuery
+from toolkit.pose.map_matching import MAX_SHARES, Misfit, find_misfit
 
 Floats = NDArray[np.float64]
 MAX_ERROR_DEG = 0.45

@@ -14,7 +14,7 @@ from tests.queries import session_query
 from tests.rendered import LIST, LOW, World, run_stage
 from toolkit import geometry
 from toolkit.capture import Capture, Trajectory
-from toolkit.features.matching import MutualMatcher
+from toolkit.features.features import MutualMatcher
 from toolkit.features.stores import extract_session
 from toolkit.files import SceneFiles
 from toolkit.pose.base import Prior, QueryInput, QueryResult, References, Status

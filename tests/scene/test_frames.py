@@ -12,8 +12,8 @@ import pytest
 from tests.sequences.drifting import Drive, drive, lost_in_a_gap
 from toolkit import geometry
 from toolkit.errors import CameraError, ImageError
-from toolkit.features.features import SiftExtractor
-from toolkit.features.matching import LocalMethod, MutualMatcher
+from toolkit.features.features import MutualMatcher, SiftExtractor
+from toolkit.features.matching import LocalMethod
 from toolkit.manifest import LocalizeSettings, SequenceSettings
 from toolkit.pose.base import QueryResult, RoughPose, Status
 from toolkit.scene import frames

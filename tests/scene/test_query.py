@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from tests.displayed import picture_of
 from tests.rendered import localized_by_pnp
 from toolkit.errors import ArtifactError
+from toolkit.features.stores import FeatureStore
 from toolkit.figures.answers import Answer
 from toolkit.files import SceneFiles
 from toolkit.geometry import transform
@@ -61,6 +63,16 @@ def test_the_verbs_by_hand_are_locate(
     np.testing.assert_array_equal(result.world_from_rig, located.world_from_rig)
     assert (result.status, result.num_inliers) == (Status.OK, located.num_inliers)
     assert repr(result).startswith("QueryResult(ok, at (")
+
+
+def test_a_query_reads_no_features_of_the_map(
+    files: SceneFiles, query: Query, references: list[References], result: QueryResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (pair,) = files.poses_dir.glob("*.h5")
+    opened = Map.of_pair(pair, "ios", files.features, files.maps)
+    assert opened.localizer.image_names
+    monkeypatch.setattr(FeatureStore, "__getitem__", Mock(side_effect=AssertionError("read for a query")))
+    np.testing.assert_array_equal(opened.locate(query, references=references).world_from_rig, result.world_from_rig)
 
 
 def test_a_result_shows_itself_with_its_true_error(scene_map: Map, result: QueryResult) -> None:

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -115,7 +115,7 @@ class Vectors:
             stacked[name] = replace(parts[0], **joined)
         return cls(stacked)
 
-    @property
+    @cached_property
     def dims(self) -> tuple[int, ...]:
         return tuple(part.dim for part in self.parts.values())
 

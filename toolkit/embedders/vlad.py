@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from toolkit.capture.images import default_workers, prefetch
 from toolkit.errors import COMMAND, ArtifactError, ToolkitError
-from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures
-from toolkit.features.matching import unit_descriptors
+from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures, unit_descriptors
 from toolkit.files import file_fingerprint, require_whole, write_atomic
 from toolkit.geometry import rounded, unit
 from toolkit.threads import fixed_sums

@@ -42,8 +42,7 @@ from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import COMMAND, ArtifactError, CaptureError, DamagedError, ImageError, ManifestError, first_line
 from toolkit.exchange.georeference import GEO_COLUMNS, geographic_poses, origin_of
 from toolkit.exchange.submission import open_captures
-from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures
-from toolkit.features.matching import PairMatches
+from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures, PairMatches
 from toolkit.features.stores import FeatureStore, MatchStore, features_path, match_name, write_features, write_matches
 from toolkit.files import (
     SceneFiles,

@@ -38,16 +38,8 @@ from toolkit.exchange.georeference import RECORD, place, read_positions
 from toolkit.exchange.import_report import ImportReport
 from toolkit.exchange.interchange import once, read_intrinsics, read_poses
 from toolkit.exchange.photographs import TAKEN_SUFFIXES, Photograph, Prefixes, gather, initial_cameras, join, read_rigs
-from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor
-from toolkit.features.matching import (
-    LocalMethod,
-    MutualMatcher,
-    PairMatches,
-    create_local_methods,
-    epipolar_matches,
-    resolve_auto,
-    unit_descriptors,
-)
+from toolkit.features.features import KINDS, LocalFeatures, MutualMatcher, PairMatches, SiftExtractor, unit_descriptors
+from toolkit.features.matching import LocalMethod, create_local_methods, epipolar_matches, resolve_auto
 from toolkit.features.stores import FeatureStore, extract_session, match_sessions
 from toolkit.files import (
     IMPORTED,

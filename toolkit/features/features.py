@@ -1,5 +1,6 @@
 """Local features of images, and the kinds that can be extracted; SIFT (Lowe, IJCV 2004) with RootSIFT descriptors
-(Arandjelovic and Zisserman, CVPR 2012), on whole arrays. `stores` keeps features in files.
+(Arandjelovic and Zisserman, CVPR 2012), on whole arrays; and mutual nearest neighbors among them. `stores` keeps
+features in files, `matching` has the other ways to match them.
 
 All keypoints of an image are refined, oriented and described together, which takes less than two thirds of the time of
 OpenCV's SIFT. Two choices differ from OpenCV, and both give more correct matches:
@@ -612,3 +613,104 @@ def _descriptors(pyramid: _Pyramid, keypoints: _Keypoints, angles: _Floats) -> N
     descriptors /= np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12)
     root = np.sqrt(descriptors, out=descriptors)
     return np.minimum(root * DESCRIPTOR_SCALE + 0.5, 255).astype(np.uint8)
+
+
+# Mutual nearest neighbors
+
+
+@dataclass(frozen=True)
+class PairMatches:
+    """K matches of the features of two images."""
+
+    indices: Ints  # (K, 2) index of the first image's feature, index of the second's; no feature is matched twice
+    scores: NDArray[np.float32]  # (K,) cosine similarity of descriptors, or confidence of a network; larger is better
+
+    @classmethod
+    def none(cls) -> "PairMatches":
+        return cls(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+
+class MutualMatcher:
+    """Matches mutual nearest neighbors that pass Lowe's ratio test, for any descriptors; see `mutual_matches`."""
+
+    batch_size = 1
+
+    def __init__(self, ratio: float = 0.8, min_score: float = -1.0, shorten: Shorten | None = None):
+        """See `FeatureKind` for the arguments."""
+        self.ratio, self.min_score, self.shorten = ratio, min_score, shorten
+
+    @classmethod
+    def of(cls, kind: FeatureKind) -> "MutualMatcher":
+        """Return the matcher of a kind of features."""
+        return cls(kind.ratio, kind.min_score, kind.shorten)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        limits = {"ratio": self.ratio, "min_score": self.min_score}
+        return {"name": "mutual", **limits, **shorten_settings(self.shorten)}
+
+    def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
+        """Return the matches of pairs of images; the ratio test applies to the first image's features."""
+        matches, previous, unit_a = [], None, np.zeros((0, 0), np.float32)
+        for a, b in pairs:
+            if a is not previous:  # usually one image is matched with several
+                previous, unit_a = a, unit_descriptors(a.descriptors, self.shorten)
+            matches.append(self.match_unit(unit_a, unit_descriptors(b.descriptors, self.shorten)))
+        return matches
+
+    @fixed_sums
+    def match_unit(self, unit_a: NDArray[np.float32], unit_b: NDArray[np.float32]) -> PairMatches:
+        """Return the matches of two images, given by their `unit_descriptors`."""
+        if not len(unit_a) or not len(unit_b):  # empty descriptors may have another length
+            return PairMatches.none()
+        scores = unit_a @ unit_b.T
+        indices = mutual_matches(scores, self.ratio, self.min_score)
+        return PairMatches(indices, scores[indices[:, 0], indices[:, 1]])
+
+
+def unit_descriptors(descriptors: Descriptors, shorten: Shorten | None = None) -> NDArray[np.float32]:
+    """Return the descriptors (N, D) of `LocalFeatures` as float32 vectors of length about 1; for `shorten` see
+    `FeatureKind`.
+    """
+    vectors = descriptors.astype(np.float32, copy=False)
+    if descriptors.dtype == np.uint8:
+        vectors = vectors * np.float32(1.0 / DESCRIPTOR_SCALE)
+    return shorten(vectors) if shorten else vectors
+
+
+def mutual_matches(scores: NDArray[np.float32], ratio: float = 0.8, min_score: float = -1.0) -> Ints:
+    """Return mutual nearest neighbors whose rows pass Lowe's ratio test: indices (K, 2) of rows and columns.
+
+    Args:
+        scores: (N, M) cosine similarities; less than -1 for pairs that geometry excludes.
+        ratio: the Euclidean distance of the nearest neighbor must be below `ratio` times that of the second nearest.
+        min_score: smallest cosine similarity of a match.
+    """
+    n, m = scores.shape
+    if n == 0 or m == 0:
+        return np.zeros((0, 2), np.int64)
+    best, second = two_best(scores)
+    rows = np.arange(n)
+    top = scores[rows, best]
+    # |a - b|^2 = 2 - 2 a.b for unit vectors
+    keep = np.flatnonzero(((1.0 - top) < ratio**2 * (1.0 - second)) & (top > min_score))
+    keep = keep[top[keep] == scores.max(axis=0)[best[keep]]]
+    # If several rows are equally near to a column, keep the first.
+    keep = keep[np.sort(np.unique(best[keep], return_index=True)[1])]
+    return np.stack([keep, best[keep]], axis=1)
+
+
+def two_best(scores: NDArray[np.float32]) -> tuple[Ints, NDArray[np.float32]]:
+    """Return the best column (N,) and the second best score (N,) of each row; the score is -1 if there is none."""
+    best = np.argmax(scores, axis=1)
+    if scores.shape[1] == 1:
+        return best, np.full(len(scores), -1.0, np.float32)
+    rows = np.arange(len(scores))
+    top = scores[rows, best]
+    scores[rows, best] = -2.0
+    second = np.maximum(scores.max(axis=1), np.float32(-1.0))
+    scores[rows, best] = top
+    return best, second

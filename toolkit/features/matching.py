@@ -1,5 +1,5 @@
-"""Match local features between images: mutual nearest neighbors, networks, or along epipolar lines; and verify them:
-count the matches of two images that agree with one relative pose of their cameras.
+"""Match local features between images: the matchers, of which `mutual` is in `features`, or along epipolar lines; and
+verify them: count the matches of two images that agree with one relative pose of their cameras.
 """
 
 import logging
@@ -18,7 +18,7 @@ from scipy.special import gammaln
 
 from toolkit.errors import ManifestError
 from toolkit.features import features as feature_types
-from toolkit.features.features import DESCRIPTOR_SCALE, Descriptors, Extractor, FeatureKind, LocalFeatures, Shorten
+from toolkit.features.features import Extractor, LocalFeatures, MutualMatcher, PairMatches, two_best
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import AUTO, LocalizeSettings, RerankSettings, checkpoint_of, nearest
 from toolkit.models import weights
@@ -29,7 +29,7 @@ from toolkit.threads import fixed_sums
 log = logging.getLogger(__name__)
 MIN_CONFIDENCE = 0.1  # smallest confidence of a match of a learned matcher
 MATCHERS: dict[str, str] = {
-    "mutual": "toolkit.features.matching:MutualMatcher",
+    "mutual": "toolkit.features.features:MutualMatcher",
     "lightglue": "toolkit.features.network:LightGlueMatcher",
 }
 """Name of a matcher -> `module:callable` that makes it; imported when needed."""
@@ -46,21 +46,6 @@ MAP_IMAGES_KEPT = 256  # number of map images whose features stay in memory, abo
 MAX_ERROR_DEG = 0.2  # largest Sampson error of a match that agrees, as an angle seen from the camera, degrees
 MAX_ERROR_SHARE = 0.003  # the same without intrinsics, in multiples of the longer side of the image
 MAX_TRIALS = 500  # largest number of RANSAC samples, of five matches each; the best matches are sampled first
-
-
-@dataclass(frozen=True)
-class PairMatches:
-    """K matches of the features of two images."""
-
-    indices: Ints  # (K, 2) index of the first image's feature, index of the second's; no feature is matched twice
-    scores: NDArray[np.float32]  # (K,) cosine similarity of descriptors, or confidence of a network; larger is better
-
-    @classmethod
-    def none(cls) -> "PairMatches":
-        return cls(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
-
-    def __len__(self) -> int:
-        return len(self.indices)
 
 
 class Matcher(Protocol):
@@ -139,44 +124,6 @@ def weights_files(settings: LocalizeSettings) -> list[Path]:
     return [weights.resolve_weights(source, checkpoint) for source, checkpoint in local_weights(settings)]
 
 
-class MutualMatcher:
-    """Matches mutual nearest neighbors that pass Lowe's ratio test, for any descriptors; see `mutual_matches`."""
-
-    batch_size = 1
-
-    def __init__(self, ratio: float = 0.8, min_score: float = -1.0, shorten: Shorten | None = None):
-        """See `FeatureKind` for the arguments."""
-        self.ratio, self.min_score, self.shorten = ratio, min_score, shorten
-
-    @classmethod
-    def of(cls, kind: FeatureKind) -> "MutualMatcher":
-        """Return the matcher of a kind of features."""
-        return cls(kind.ratio, kind.min_score, kind.shorten)
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        limits = {"ratio": self.ratio, "min_score": self.min_score}
-        return {"name": "mutual", **limits, **feature_types.shorten_settings(self.shorten)}
-
-    def match(self, pairs: Sequence[tuple[LocalFeatures, LocalFeatures]]) -> list[PairMatches]:
-        """Return the matches of pairs of images; the ratio test applies to the first image's features."""
-        matches, previous, unit_a = [], None, np.zeros((0, 0), np.float32)
-        for a, b in pairs:
-            if a is not previous:  # usually one image is matched with several
-                previous, unit_a = a, unit_descriptors(a.descriptors, self.shorten)
-            matches.append(self.match_unit(unit_a, unit_descriptors(b.descriptors, self.shorten)))
-        return matches
-
-    @fixed_sums
-    def match_unit(self, unit_a: NDArray[np.float32], unit_b: NDArray[np.float32]) -> PairMatches:
-        """Return the matches of two images, given by their `unit_descriptors`."""
-        if not len(unit_a) or not len(unit_b):  # empty descriptors may have another length
-            return PairMatches.none()
-        scores = unit_a @ unit_b.T
-        indices = mutual_matches(scores, self.ratio, self.min_score)
-        return PairMatches(indices, scores[indices[:, 0], indices[:, 1]])
-
-
 @dataclass(frozen=True)
 class LocalMethod:
     """One kind of local features, with its extractor and matcher."""
@@ -232,49 +179,22 @@ def create_local_methods(
 AnyMethod = LocalMethod | DeferredMethod
 
 
-def unit_descriptors(descriptors: Descriptors, shorten: Shorten | None = None) -> NDArray[np.float32]:
-    """Return the descriptors (N, D) of `LocalFeatures` as float32 vectors of length about 1; for `shorten` see
-    `FeatureKind`.
+def create_methods(settings: LocalizeSettings) -> tuple[list[LocalMethod], list[DeferredMethod]]:
+    """Return the kinds of features that every query needs, and those for queries without a sure pose.
+
+    Raise WeightsError if a network has no weights.
     """
-    unit = descriptors.astype(np.float32, copy=False)
-    if descriptors.dtype == np.uint8:
-        unit = unit * np.float32(1.0 / DESCRIPTOR_SCALE)
-    return shorten(unit) if shorten else unit
+    if settings.method == "nearest":
+        return [], []
+    further = settings.features.escalation if settings.method in ("pnp", "hybrid") else []
+    if further:
+        weights_files(settings)
+    return create_local_methods(settings), [DeferredMethod(settings, name) for name in further]
 
 
-def mutual_matches(scores: NDArray[np.float32], ratio: float = 0.8, min_score: float = -1.0) -> Ints:
-    """Return mutual nearest neighbors whose rows pass Lowe's ratio test: indices (K, 2) of rows and columns.
-
-    Args:
-        scores: (N, M) cosine similarities; less than -1 for pairs that geometry excludes.
-        ratio: the Euclidean distance of the nearest neighbor must be below `ratio` times that of the second nearest.
-        min_score: smallest cosine similarity of a match.
-    """
-    n, m = scores.shape
-    if n == 0 or m == 0:
-        return np.zeros((0, 2), np.int64)
-    best, second = _two_best(scores)
-    rows = np.arange(n)
-    top = scores[rows, best]
-    # |a - b|^2 = 2 - 2 a.b for unit vectors
-    keep = np.flatnonzero(((1.0 - top) < ratio**2 * (1.0 - second)) & (top > min_score))
-    keep = keep[top[keep] == scores.max(axis=0)[best[keep]]]
-    # If several rows are equally near to a column, keep the first.
-    keep = keep[np.sort(np.unique(best[keep], return_index=True)[1])]
-    return np.stack([keep, best[keep]], axis=1)
-
-
-def _two_best(scores: NDArray[np.float32]) -> tuple[Ints, NDArray[np.float32]]:
-    """Return the best column (N,) and the second best score (N,) of each row; the score is -1 if there is none."""
-    best = np.argmax(scores, axis=1)
-    if scores.shape[1] == 1:
-        return best, np.full(len(scores), -1.0, np.float32)
-    rows = np.arange(len(scores))
-    top = scores[rows, best]
-    scores[rows, best] = -2.0
-    second = np.maximum(scores.max(axis=1), np.float32(-1.0))
-    scores[rows, best] = top
-    return best, second
+def needs_upright(settings: LocalizeSettings, kinds: Sequence[AnyMethod]) -> bool:
+    """Tell whether a network that localizes needs upright images; `kinds` are the kinds of features."""
+    return settings.predicts or any(feature_types.KINDS[kind.name].upright for kind in kinds)
 
 
 @fixed_sums
@@ -347,7 +267,7 @@ def match_along_epipolar_lines(
             window = column_score[first : first + width]
             np.maximum(window, top, out=window)
         scores = scores.reshape(-1, width)
-        best, second = _two_best(scores)
+        best, second = two_best(scores)
         top = scores[np.arange(len(scores)), best]
         good = np.flatnonzero((top > min_score) & ((1.0 - top) < ratio**2 * (1.0 - second)))
         row_best[start * _BLOCK + good] = in_b[good // _BLOCK, best[good]]

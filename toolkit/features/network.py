@@ -16,8 +16,8 @@ from torch.nn import functional as F
 from torch.nn.utils.rnn import pad_sequence
 
 from toolkit.errors import ManifestError, ToolkitError, optional
-from toolkit.features.features import LocalFeatures
-from toolkit.features.matching import MATCHER_WEIGHTS, PairMatches
+from toolkit.features.features import LocalFeatures, PairMatches
+from toolkit.features.matching import MATCHER_WEIGHTS
 from toolkit.files import Remade
 from toolkit.manifest import AlikedSettings, SuperPointSettings
 from toolkit.models.aliked import Aliked, find_keypoints

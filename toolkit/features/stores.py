@@ -21,8 +21,16 @@ from tqdm.auto import tqdm
 from toolkit.capture import Session
 from toolkit.capture.images import camera_text, default_workers, prefetch, read_image, sees_all
 from toolkit.errors import ArtifactError, ImageError
-from toolkit.features.features import KINDS, Extractor, LocalFeatures, SiftExtractor, extract_turned, usable
-from toolkit.features.matching import Matcher, PairMatches
+from toolkit.features.features import (
+    KINDS,
+    Extractor,
+    LocalFeatures,
+    PairMatches,
+    SiftExtractor,
+    extract_turned,
+    usable,
+)
+from toolkit.features.matching import Matcher
 from toolkit.files import files_fingerprint, fingerprint, link_folder
 from toolkit.geometry import Ints
 from toolkit.store.items import Items

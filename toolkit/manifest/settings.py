@@ -509,7 +509,7 @@ class PnpSettings(Settings):
     constants = {
         "pose/pnp.py": "clear_inlier_ratio contested_inlier_ratio contested_references "
         "guided_radii_deg max_guided_matches ok_rival_support",
-        "pose/rig.py": "max_ransac_matches ransac_max_trials",
+        "pose/base.py": "max_ransac_matches ransac_max_trials",
         "pose/map_matching.py": "guided_images max_map_features max_query_features",
         "scene/map.py": "sure_position_std_m",
     }

@@ -17,8 +17,16 @@ from toolkit import geometry
 from toolkit.capture import Session
 from toolkit.capture.images import camera_text, default_workers, in_view, prefetch, rays_of, read_image, view_bounds
 from toolkit.errors import ArtifactError, ImageError
-from toolkit.features.features import KINDS, FeatureKind, LocalFeatures, feature_kind, shorten_settings
-from toolkit.features.matching import PairMatches, match_along_epipolar_lines, unit_descriptors
+from toolkit.features.features import (
+    KINDS,
+    FeatureKind,
+    LocalFeatures,
+    PairMatches,
+    feature_kind,
+    shorten_settings,
+    unit_descriptors,
+)
+from toolkit.features.matching import match_along_epipolar_lines
 from toolkit.features.stores import FeatureStore, MatchStore, match_name, matches_path, write_matches
 from toolkit.files import Remade, fingerprint, is_current, temporary_folder, write_sidecar
 from toolkit.geometry import Floats, Ints

@@ -20,8 +20,8 @@ from scipy.spatial import KDTree
 
 from toolkit import geometry
 from toolkit.capture.images import default_workers, prefetch, rays_of
-from toolkit.features.features import FeatureKind, LocalFeatures
-from toolkit.features.matching import MutualMatcher, verified_matches
+from toolkit.features.features import FeatureKind, LocalFeatures, MutualMatcher
+from toolkit.features.matching import verified_matches
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import RerankSettings
 from toolkit.mapping.local_map import OPENGL_AXES, Consistency, LocalMap
@@ -52,6 +52,10 @@ MAX_WEAK = 8  # largest number of images that are checked individually, so that 
 NOMINAL_DEPTH = 10.0  # median depth to which a map with poses of unknown unit is scaled for the localizers
 USUAL_DEPTHS_M = (2.0, 16.0)
 """Range of median depths for which the limits of the localizers, in meters, apply unchanged."""
+ODD_DEPTHS_M = (0.1, 200.0)
+"""Plausible range of a map's median depth, meters; outside, the map may be in another unit."""
+WORTH_DEG, WORTH_LENGTHS = 0.05, 0.005
+"""Noise of the map's poses, degrees and map lengths per axis, from which the user is told of it."""
 
 
 class SurveyedImages(NamedTuple):
@@ -372,3 +376,35 @@ def _axes_text(axes: Floats) -> str:
 def _axes(axes: Floats) -> str:
     """Name the signed axes in the columns of a matrix, such as "x, -y, -z"."""
     return ", ".join(f"{'-' if column.sum() < 0 else ''}{'xyz'[int(np.argmax(np.abs(column)))]}" for column in axes.T)
+
+
+# What the user is told
+
+
+def remarks(consistency: Consistency, length: float, metric: bool) -> str:
+    """Return warnings about the poses of a map; empty if there are none.
+
+    Args:
+        consistency: of the map.
+        length: that of the map, see `Survey.length`.
+        metric: whether the poses are in meters, as far as is known.
+    """
+    parts = [consistency.text, _noise_text(consistency, length, metric)]
+    depth = length * USUAL_DEPTHS_M[int(length > 1)]
+    measured = metric and length != 1 and consistency.verdict != "inconsistent"
+    if measured and not ODD_DEPTHS_M[0] < depth < ODD_DEPTHS_M[1]:
+        parts.append(
+            f"the median depth of the map is {depth:.3g} m: if its poses are not in meters, write `unit: null` in "
+            "the manifest, or import them with their `--unit`"
+        )
+    return "; ".join(filter(None, parts))
+
+
+def _noise_text(noise: Consistency, length: float, metric: bool) -> str:
+    """Return how good the poses are, if their noise is worth a word."""
+    small = noise.rotation_noise_deg < WORTH_DEG and noise.position_noise < WORTH_LENGTHS
+    if small or not noise.trusted:  # wrong intrinsics look like noise of the poses
+        return ""
+    unit, factor = ("cm", length) if metric else ("% of the median depth", 1 / NOMINAL_DEPTH)
+    rotation_deg, position = np.sqrt(3) * noise.rotation_noise_deg, np.sqrt(3) * noise.position_noise * factor
+    return f"the poses of the map are good to about {rotation_deg:.2g} deg, {100 * position:.2g} {unit}"

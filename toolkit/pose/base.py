@@ -1,5 +1,5 @@
 """A query and its references go into all localizers, its result comes out: status and reason, pose, evidence,
-references, and correspondences.
+references, and correspondences. In between, the query's cameras compute poses, projections and errors of its matches.
 """
 
 import re
@@ -9,18 +9,36 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from html import escape
 from pathlib import Path
+from threading import Lock
 from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 import pandas as pd
+import poselib
 import pycolmap
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from toolkit import geometry
-from toolkit.capture.images import camera_text, pixels_of, stored_size, thumbnails
+from toolkit.capture.images import (
+    camera_text,
+    pixels_of,
+    projection_jacobian,
+    stored_size,
+    thumbnails,
+    view_bounds,
+)
 from toolkit.errors import INTERNAL, ArtifactError, CameraError
-from toolkit.features.features import KINDS, LocalFeatures, extract_turned, usable
-from toolkit.features.matching import AnyMethod, PairMatches
+from toolkit.features.features import (
+    KINDS,
+    LocalFeatures,
+    PairMatches,
+    Shorten,
+    extract_turned,
+    unit_descriptors,
+    usable,
+)
+from toolkit.features.matching import AnyMethod
 from toolkit.geometry import Floats, Ints
 
 CAMERA = "camera?"
@@ -58,6 +76,32 @@ MAX_STATUS = 70
 """Letters of a status that tables and titles show; the tables of the poses have all of it."""
 NetworkMatches = Callable[[str], PairMatches]
 """Returns the stored network matches between a query image and the map image of a given name."""
+
+# Of the poses of a rig
+RANSAC_CONFIDENCE = 0.999
+MAX_RANSAC_TRIALS = 5000
+"""Largest number of RANSAC samples."""
+MAX_RANSAC_MATCHES = 2500
+"""Largest number of matches given to RANSAC, chosen at random; guided matching finds the others again."""
+LOSS_PX = 1.0
+"""Scale of the loss of a refinement from a rough pose, pixels."""
+LOSS_SHARE = 0.6
+"""Scale from a close pose, as a share of the median error. Errors of points and keypoints have heavy tails: with 1 px,
+the position errors of the captures in docs/results.md are 4 % larger. With a smaller share, poses are clearly worse
+where errors are Gaussian, and the covariance, which is that of plain least squares, is too small for them."""
+MIN_LOSS_PX = 0.05
+"""Smallest scale, pixels: exact matches have no error."""
+STEP = 1e-8
+"""Length of the step, meters and radians, after which a refinement ends. With 1e-6, 1.7 micrometers are left."""
+CELLS = 4
+"""Columns and rows of the cells of an image."""
+POSELIB_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
+"""COLMAP's names of the camera models that PoseLib 2.0.5 can refine with. With others it returns the pose unchanged."""
+# PoseLib's solver for rigs uses the random generator of the C library, which all threads share. So that equal seeds
+# give equal poses, it is seeded before each call, and only one call runs at a time. Other libraries (ZeroMQ in a
+# notebook) may still draw from it and change the last digits: so the pose is rounded before it is refined.
+_RIG_RANSAC = Lock()
+_DECIMALS = 9
 
 
 class Status(StrEnum):
@@ -191,8 +235,8 @@ class QueryResult:
     """Intrinsics that fit the query better than the stated ones; images that cannot be read; for a prediction, what was
     left out or is unknown. Column `reason` of the table."""
     misfit: bool = False
-    """Whether the matches contradict the intrinsics of the query, see `rig.find_misfit`. No other features repair
-    that. A small contradiction only widens the covariance."""
+    """Whether the matches contradict the intrinsics of the query, see `map_matching.find_misfit`. No other features
+    repair that. A small contradiction only widens the covariance."""
     focals_px: tuple[float, ...] = ()
     """Per query image, the focal length that fits, or NaN if the focal length is not the problem. Empty if the
     intrinsics are not contradicted."""
@@ -230,7 +274,7 @@ class QueryResult:
         return self._in_map.show_3d([self, *others], rays)
 
     def what_if(self, changes: Mapping[str, Any] | None = None, **more: Any) -> Any:
-        """Localize the query again with something changed; see `scene.query.Located.what_if`."""
+        """Localize the query again with something changed; see `scene.query.what_if`."""
         return self._in_map.what_if(self, changes or {}, **more)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -432,7 +476,9 @@ class View:
         """
         if (color, least_side) not in self._decoded:
             pixels = pixels_of(self.image, not color, least_side)
-            width, height = stored_size(self.image) if isinstance(self.image, Path) else pixels.shape[1::-1]
+            width, height = pixels.shape[1::-1]
+            if least_side is not None and isinstance(self.image, Path):  # perhaps decoded at a smaller size
+                width, height = stored_size(self.image)
             if (self.camera.width, self.camera.height) != (width, height):
                 raise CameraError(
                     f"The image is {width} x {height} pixels, its camera {self.camera.width} x "
@@ -599,3 +645,254 @@ class NearestLocalizer(Localizer):
         world_from_rig = self.world_from_cams[reference] @ geometry.invert(query.rig_from_cams[camera])
         names = (self.image_names[reference],)
         return QueryResult(Status.LOW_CONFIDENCE, "", world_from_rig, references=names, found_by="nearest")
+
+
+# The cameras of a query, and their matches with map points
+
+
+@dataclass(frozen=True)
+class Matches:
+    """K matches of query keypoints with map points."""
+
+    camera: Ints
+    """(K,) index of the query image."""
+    pixels: Floats
+    """(K, 2) keypoints in that image."""
+    point: Ints
+    """(K,) index of the map point."""
+
+    @classmethod
+    def pooled(cls, parts: "Sequence[Matches]") -> "Matches":
+        """Return the matches of all parts, in order."""
+        return cls(
+            np.concatenate([np.zeros(0, np.int64), *(part.camera for part in parts)]),
+            np.concatenate([np.zeros((0, 2)), *(part.pixels for part in parts)]),
+            np.concatenate([np.zeros(0, np.int64), *(part.point for part in parts)]),
+        )
+
+    def rows(self) -> NDArray[np.void]:
+        """Return the matches (K,) as values that can be tested for equality."""
+        rows = np.ascontiguousarray(np.column_stack([self.camera, self.point, self.pixels]))
+        return rows.view([("", rows.dtype)] * rows.shape[1])[:, 0]
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+    def __getitem__(self, part: NDArray[np.bool_] | Ints) -> "Matches":
+        return Matches(self.camera[part], self.pixels[part], self.point[part])
+
+
+class RigQuery:
+    """The cameras of a query and their features; computes poses, projections and errors of matches.
+
+    A single camera is a rig of one.
+    """
+
+    def __init__(self, cameras: list[pycolmap.Camera], rig_from_cams: Floats, features: list[list[LocalFeatures]]):
+        self.cameras = cameras
+        self.rig_from_cams = rig_from_cams
+        self.features = features  # [camera][kind]
+        self._cams_from_rig = [_poselib(pose) for pose in geometry.invert(rig_from_cams)]
+        self.focals_px = np.array([camera.mean_focal_length() for camera in cameras])
+        self.bounds = np.stack([view_bounds(camera) for camera in cameras])
+        self._unit: dict[tuple[int, int], NDArray[np.float32]] = {}
+        self.trees = [
+            [KDTree(f.keypoints) if len(f) else KDTree(np.zeros((1, 2)) - 1e9) for f in kinds] for kinds in features
+        ]
+
+    def unit_descriptors(self, camera: int, kind: int, shorten: Shorten | None) -> NDArray[np.float32]:
+        """Return the `unit_descriptors` (N, D) of an image's features of one kind; `shorten` belongs to the kind."""
+        if (camera, kind) not in self._unit:
+            self._unit[camera, kind] = unit_descriptors(self.features[camera][kind].descriptors, shorten)
+        return self._unit[camera, kind]
+
+    def num_cells(self, matches: Matches) -> int:
+        """Return the number of cells, of all images, with a match."""
+        return len(np.unique(self.cells(matches)))
+
+    def cells(self, matches: Matches, along: int = CELLS) -> Ints:
+        """Return the cells (K,) of matches, as numbers; an image has `along` columns and rows of them."""
+        sizes = np.array([(camera.width, camera.height) for camera in self.cameras])
+        column, row = np.clip(along * matches.pixels / sizes[matches.camera], 0, along - 1).astype(np.int64).T
+        return np.asarray((matches.camera * along + row) * along + column, np.int64)
+
+    def pixels(self, camera: Ints, keypoint: Ints, kind: int) -> Floats:
+        """Return the pixels (K, 2) of keypoints of one kind, given by camera (K,) and index (K,)."""
+        pixels = np.zeros((len(camera), 2))
+        for index, kinds in enumerate(self.features):
+            pixels[camera == index] = kinds[kind].keypoints[keypoint[camera == index]]
+        return pixels
+
+    def ransac(
+        self,
+        matches: Matches,
+        points: Floats,
+        max_error_deg: float,
+        seed: int,
+        least_inliers: int = 0,
+        max_trials: int = MAX_RANSAC_TRIALS,
+    ) -> Floats | None:
+        """Return the pose rig_from_world (4, 4) with the most inliers, by LO-RANSAC (PoseLib), or None.
+
+        Errors are measured on the undistorted image plane at depth 1, times the mean focal length.
+
+        Args:
+            matches: K matches.
+            points: (P, 3) the map points.
+            max_error_deg: inlier threshold, as an angle.
+            seed: of the random generators.
+            least_inliers: RANSAC may miss poses with fewer inliers, which saves time.
+            max_trials: largest number of samples.
+        """
+        if len(np.unique(matches.point)) < 4:
+            return None
+        if len(matches) > MAX_RANSAC_MATCHES:
+            chosen = np.random.default_rng(seed).permutation(len(matches))
+            kept = np.zeros(len(matches), bool)
+            kept[chosen[:MAX_RANSAC_MATCHES]] = True
+            least_inliers = least_inliers * MAX_RANSAC_MATCHES // len(matches)
+            matches = matches[kept]
+        least_share = np.clip(least_inliers / len(matches), 1e-3, 0.99)
+        trials = np.log(1 - RANSAC_CONFIDENCE) / np.log1p(-(least_share**3))  # to draw one sample of three inliers
+        options = {
+            "success_prob": RANSAC_CONFIDENCE,
+            "dyn_num_trials_mult": 1.0,
+            "min_iterations": 100,
+            "max_iterations": int(np.clip(trials, 100, max_trials)),
+            "seed": seed,
+            "max_reproj_error": float(np.tan(np.radians(max_error_deg)) * self.focals_px.mean()),
+        }
+        origin = geometry.local_origin(points[matches.point])
+        pixels, xyz, cameras = self._by_camera(matches, points, origin, undistort=True)
+        if sum(map(len, xyz)) < 4:
+            return None
+        if len(self.cameras) == 1:
+            pose, info = poselib.estimate_absolute_pose(pixels[0], xyz[0], cameras[0], options)
+        else:
+            with _RIG_RANSAC:
+                pycolmap.set_random_seed(seed)  # seeds the C library, too
+                pose, info = poselib.estimate_generalized_absolute_pose(
+                    pixels, xyz, self._cams_from_rig, cameras, options
+                )
+        if info["num_inliers"] < 4 or not np.isfinite(pose.Rt).all():
+            return None
+        if len(self.cameras) == 1:
+            return _from_world(self.rig_from_cams[0] @ _matrix(pose.Rt), origin)
+        rotation = geometry.quaternion_to_rotation(np.round(pose.q, _DECIMALS))
+        return _from_world(geometry.make_pose(rotation, np.round(pose.t, _DECIMALS - 3)), origin)
+
+    def _by_camera(
+        self, matches: Matches, points: Floats, origin: Floats, undistort: bool
+    ) -> tuple[list[Floats], list[Floats], list[dict[str, Any]]]:
+        """Return pixels (n, 2) and points (n, 3) of the matches of each camera, and the cameras, as PoseLib takes them.
+
+        Args:
+            origin: (3,) in the world, origin of the returned points.
+            undistort: return pixels of pinhole cameras with the mean focal length of the rig, not of the actual lenses.
+        """
+        focal_px = float(self.focals_px.mean())
+        pixels, xyz, cameras = [], [], []
+        for index, camera in enumerate(self.cameras):
+            part = matches.camera == index
+            xy, in_world = matches.pixels[part], points[matches.point[part]] - origin
+            model, params = camera.model.name, camera.params.tolist()
+            if undistort or model not in POSELIB_MODELS:
+                xy = focal_px * np.asarray(camera.cam_from_img(xy)).reshape(-1, 2)
+                finite = np.isfinite(xy).all(axis=1)
+                xy, in_world = xy[finite], in_world[finite]
+                model, params = "SIMPLE_PINHOLE", [focal_px, 0.0, 0.0]
+            pixels.append(xy)
+            xyz.append(in_world)
+            cameras.append({"model": model, "width": camera.width, "height": camera.height, "params": params})
+        return pixels, xyz, cameras
+
+    def refine(self, rig_from_world: Floats, matches: Matches, points: Floats, close: bool = False) -> Floats:
+        """Return rig_from_world (4, 4) that minimizes the reprojection errors of matches, by PoseLib.
+
+        The loss is Cauchy's. For camera models that PoseLib does not know, errors are measured as in `ransac`.
+
+        Args:
+            rig_from_world: the pose to start from, (4, 4).
+            matches: K matches.
+            points: (P, 3) the map points.
+            close: whether that pose is refined already. The scale of the loss then follows the errors, up to `LOSS_PX`,
+                if PoseLib knows the lenses.
+        """
+        scale_px = LOSS_PX
+        if close and len(matches) > 6 and all(camera.model.name in POSELIB_MODELS for camera in self.cameras):
+            median_px = np.median(self.errors_px(rig_from_world, matches, points))
+            # A pose fits few matches too well (Rousseeuw and Leroy 1987, "Robust Regression", section 5.1).
+            scale_px = float(np.clip(LOSS_SHARE * (1 + 5 / (len(matches) - 6)) * median_px, MIN_LOSS_PX, LOSS_PX))
+        origin = geometry.local_origin(points[matches.point])
+        pixels, xyz, cameras = self._by_camera(matches, points, origin, undistort=False)
+        options = {"loss_type": "CAUCHY", "loss_scale": scale_px, "step_tol": STEP}
+        refined, _ = poselib.refine_generalized_absolute_pose(
+            pixels, xyz, _poselib(_from_world(rig_from_world, -origin)), self._cams_from_rig, cameras, options
+        )
+        return _from_world(_matrix(refined.Rt), origin)
+
+    def projected(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
+        """Return the projections (K, 2) of the matched points in their images, pixels; inf behind a camera."""
+        pixels = np.full((len(matches), 2), np.inf)
+        for index, camera in enumerate(self.cameras):
+            part = np.flatnonzero(matches.camera == index)
+            if not len(part):
+                continue
+            cam_from_world = geometry.invert(self.rig_from_cams[index]) @ rig_from_world
+            in_cam = geometry.transform(cam_from_world, points[matches.point[part]])
+            projected = np.asarray(camera.img_from_cam(in_cam))
+            seen = (in_cam[:, 2] > 1e-3) & np.isfinite(projected).all(axis=1)
+            pixels[part] = np.where(seen[:, None], projected, np.inf)
+        return pixels
+
+    def errors_px(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
+        """Return the reprojection errors (K,) of matches with points (P, 3), pixels; inf behind a camera."""
+        errors = self.projected(rig_from_world, matches, points) - matches.pixels
+        return np.asarray(np.linalg.norm(errors, axis=1), np.float64)
+
+    def errors_deg(self, rig_from_world: Floats, matches: Matches, points: Floats) -> Floats:
+        """Return the reprojection errors (K,) as angles."""
+        errors = self.errors_px(rig_from_world, matches, points)
+        return np.degrees(np.arctan(errors / self.focals_px[matches.camera]))
+
+    def jacobians(self, rig_from_world: Floats, matches: Matches, points: Floats) -> tuple[Floats, Floats]:
+        """Return the derivatives of the projections of K matches, in pixels.
+
+        Returns:
+            The derivatives by a small motion d of the rig, (K, 2, 6): rotation (radians) and translation (meters) in
+            the rig's frame, world_from_rig @ Exp(d), as in the benchmark's covariances; and by a motion of the point in
+            the world, (K, 2, 3).
+        """
+        of_pose, of_point = np.zeros((len(matches), 2, 6)), np.zeros((len(matches), 2, 3))
+        for index in np.unique(matches.camera):
+            part = matches.camera == index
+            cam_from_rig = geometry.invert(self.rig_from_cams[index])
+            in_rig = geometry.transform(rig_from_world, points[matches.point[part]])
+            in_cam = geometry.transform(cam_from_rig, in_rig)
+            # A motion d of the rig moves a point in its frame by -(rotation x point) - translation.
+            x, y, z = in_rig.T
+            zero = np.zeros_like(x)
+            skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+            moved = np.concatenate([skew, np.broadcast_to(-np.eye(3), skew.shape)], axis=2)
+            projection = projection_jacobian(in_cam, np.full(len(in_cam), self.focals_px[index]))
+            of_pose[part] = projection @ (cam_from_rig[:3, :3] @ moved)
+            of_point[part] = projection @ (cam_from_rig[:3, :3] @ rig_from_world[:3, :3])
+        return of_pose, of_point
+
+
+def _from_world(rig_from_local: Floats, origin: Floats) -> Floats:
+    """Return rig_from_world (4, 4), given a pose in a frame whose origin (3,) is in the world; zero: the same frame."""
+    if not origin.any():
+        return np.asarray(rig_from_local, np.float64)
+    return geometry.shifted(rig_from_local, -rig_from_local[:3, :3] @ origin)
+
+
+def _poselib(pose: Floats) -> poselib.CameraPose:
+    converted = poselib.CameraPose()
+    converted.Rt = pose[:3]
+    return converted
+
+
+def _matrix(pose: Floats) -> Floats:
+    """Return a pose (3, 4) as (4, 4)."""
+    return np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])

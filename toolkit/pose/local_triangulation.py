@@ -17,8 +17,8 @@ import pycolmap
 from toolkit import geometry
 from toolkit.capture import Session
 from toolkit.capture.images import rays_of
-from toolkit.features.features import KINDS, FeatureKind, LocalFeatures
-from toolkit.features.matching import AnyMethod, PairMatches
+from toolkit.features.features import KINDS, FeatureKind, LocalFeatures, PairMatches
+from toolkit.features.matching import AnyMethod
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import MapSettings, PnpSettings
 from toolkit.mapping.build import MAX_EPIPOLAR_ERROR_PX, instants, match_pairs, select_pairs

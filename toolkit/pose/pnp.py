@@ -13,7 +13,7 @@ on statistics of the estimate. `benchmarks/confidence.py` fits the weights on re
 it darkens, blurs, fogs and half covers, and measures the calibration on held-out ones.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -26,21 +26,23 @@ from toolkit.geometry import Floats, Ints
 from toolkit.manifest import PnpSettings
 from toolkit.pose.base import (
     CAMERA,
+    CELLS,
     NOISE,
     Correspondences,
     Localizer,
+    Matches,
     Prior,
     Query,
     QueryMatches,
     QueryResult,
     References,
+    RigQuery,
     Rival,
     Status,
     agree,
     stds_of,
 )
-from toolkit.pose.map_matching import MapMatcher, MappedFeatures, MatchCache, Vicinity
-from toolkit.pose.rig import CELLS, Matches, RigQuery, find_misfit, least_squares_covariance
+from toolkit.pose.map_matching import MapMatcher, MappedFeatures, MatchCache, Vicinity, find_misfit
 from toolkit.threads import fixed_sums
 
 # Of the probability that a pose is correct
@@ -282,6 +284,8 @@ class PnpLocalizer(Localizer):
         self.matcher = MapMatcher(mapped)
         self.map = self.matcher.map
         self.image_names = self.map.image_names
+        self.lift: Callable[[Query, Sequence[References], None, Sequence[Prior]], QueryResult | None] | None = None
+        """Localizes a query that has no pose otherwise by depth maps, see `prediction.hybrid.DepthLifter`."""
 
     def match(self, query: Query, references: Sequence[References]) -> PnpMatches:
         """Return the matches of a query with its references; see `Localizer`."""
@@ -312,7 +316,11 @@ class PnpLocalizer(Localizer):
             result = self._compare(rig, all_matches, hypotheses, result, references, prior)
         result = self._with_misfit(rig, all_matches, result)
         partly = len(matches.usable) < len(matches.query.features)
-        return _of_all_images(matches, result, missing) if partly else result
+        result = _of_all_images(matches, result, missing) if partly else result
+        if self.lift is None or result.world_from_rig is not None:
+            return result
+        lifted = self.lift(matches.query, matches.references, None, priors)
+        return result if lifted is None or lifted.world_from_rig is None else lifted
 
     def _with_misfit(self, query: RigQuery, matches: Matches, estimate: QueryResult) -> QueryResult:
         """Return the estimate, with a warning if matches made without the pose contradict the query's intrinsics.
@@ -673,6 +681,40 @@ class PnpLocalizer(Localizer):
 
     def _ransac(self, query: RigQuery, matches: Matches, max_error_deg: float, least_inliers: int = 0) -> Floats | None:
         return query.ransac(matches, self.map.points, max_error_deg, self.seed, least_inliers)
+
+
+def least_squares_covariance(
+    jacobian: Floats, errors_px: Floats, noise_px2: Floats, weights: Floats | None = None
+) -> Floats | None:
+    """Return the covariance (U, U) of a least squares estimate of U unknowns from K projections; None if undefined.
+
+    It is the sandwich N^-1 M N^-1 (Huber 1967): N is the information of the projections for unit noise, M is computed
+    from the actual noise, the spread of the errors plus `noise_px2`. The spread already contains part of `noise_px2`;
+    counting it twice makes up for noise that is not modeled, such as the errors of the map's poses.
+
+    Args:
+        jacobian: (K, 2, U), derivatives of the projections by the unknowns.
+        errors_px: (K,) reprojection errors.
+        noise_px2: (K, 2, 2), covariance of each projection due to its point, square pixels. Projections whose
+            covariance is not finite are left out.
+        weights: (K,), at most 1, of the information of the projections. The spread of the errors is that of the
+            projections of weight 1. None: all have it.
+    """
+    weights = np.ones(len(errors_px)) if weights is None else weights
+    valid = np.isfinite(noise_px2).all(axis=(1, 2))
+    measured = errors_px[valid & (weights == 1)]
+    if len(measured) < 4:
+        return None
+    jacobian, noise_px2 = jacobian[valid] * np.sqrt(weights[valid])[:, None, None], noise_px2[valid]
+    # Two coordinates per point, six parameters of the pose.
+    variance = float((measured**2).sum()) / max(2 * len(measured) - 6, 1)
+    information = np.einsum("oki,okj->ij", jacobian, jacobian)
+    if not np.isfinite(information).all() or np.linalg.cond(information) > 1e14:
+        return None
+    noise = noise_px2 + variance * np.eye(2)
+    middle = np.einsum("oki,okl,olj->ij", jacobian, noise, jacobian)
+    inverse = np.linalg.inv(information)
+    return np.asarray(inverse @ middle @ inverse, np.float64)
 
 
 def _support(errors_deg: Floats, max_error_deg: float) -> float:

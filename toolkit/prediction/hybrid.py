@@ -20,10 +20,21 @@ from toolkit.capture.depths import SeenDepth, lifted
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import LocalizeSettings, PnpSettings
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.base import Localizer, Prior, Query, QueryInput, QueryResult, References, Status, agree
+from toolkit.pose.base import (
+    CELLS,
+    Localizer,
+    Matches,
+    Prior,
+    Query,
+    QueryInput,
+    QueryResult,
+    References,
+    RigQuery,
+    Status,
+    agree,
+)
 from toolkit.pose.map_matching import MAX_MAP_FEATURES, MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer, PnpMatches
-from toolkit.pose.rig import CELLS, Matches, RigQuery
 from toolkit.prediction.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer, QueryPrediction
 from toolkit.threads import fixed_sums
 
@@ -231,31 +242,12 @@ class DepthLifter:
 
 
 def lifts(settings: LocalizeSettings, map_session: Session) -> bool:
-    """Tell whether `pnp` lifts features of a map: it has depth maps, which are in meters, as its poses are."""
-    return settings.method == "pnp" and settings.unit is not None and map_session.depths is not None
+    """Tell whether `pnp` lifts features of a map: it has depth maps, which are in meters, as its poses are.
 
-
-class LiftingLocalizer(Localizer):
-    """A `PnpLocalizer` that lifts map features by depth maps for queries that have no pose without them.
-
-    Other poses stay: features of many map images tell a pose better than the depth of a few.
+    It does so for queries that have no pose without them. Other poses stay: features of many map images tell a pose
+    better than the depth of a few.
     """
-
-    def __init__(self, pnp: PnpLocalizer, seen_depth: Callable[[int], SeenDepth]) -> None:
-        self._pnp, self._lifter = pnp, DepthLifter(pnp, seen_depth, MOST_FEATURES)
-        self.image_names = pnp.image_names
-
-    def match(self, query: Query, references: Sequence[References]) -> PnpMatches:
-        """Return the matches of a query with its references; see `Localizer`."""
-        return self._pnp.match(query, references)
-
-    def solve(self, matches: PnpMatches, prediction: None = None, priors: Sequence[Prior] = ()) -> QueryResult:
-        """Return the pose from matches with triangulated points, else the one with lifted points; see `Localizer`."""
-        matched = self._pnp.solve(matches, None, priors)
-        if matched.world_from_rig is not None or not matches.usable:
-            return matched
-        lifted = self._lifter.localize(matches.query, matches.references, None, priors)
-        return matched if lifted is None or lifted.world_from_rig is None else lifted
+    return settings.method == "pnp" and settings.unit is not None and map_session.depths is not None
 
 
 class _LiftedLocalizer(PnpLocalizer):

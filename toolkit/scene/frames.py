@@ -14,7 +14,8 @@ from toolkit.errors import CameraError, ImageError
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import SequenceSettings
 from toolkit.pose.base import QueryResult, RoughPose, Status, carried_over
-from toolkit.scene.map import Map, localize_image
+from toolkit.scene.images import localize_image
+from toolkit.scene.map import Map
 from toolkit.scene.query import Image
 from toolkit.sequences.odometry import Odometry, cut, with_measured_drift
 from toolkit.sequences.pose_graph import FAR, PlacedPiece, is_sure, localize_piece, queries_of

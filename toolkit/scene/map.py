@@ -2,9 +2,8 @@
 
 import copy
 import logging
-import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from html import escape
@@ -12,34 +11,33 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
-from tqdm.auto import tqdm
 
 from toolkit import geometry
 from toolkit.capture import Capture, Session, masks
-from toolkit.capture.images import sees_all, thumbnails
+from toolkit.capture.images import thumbnails, turn_image
 from toolkit.capture.upright import Turns, upright_turns
-from toolkit.errors import COMMAND, ArtifactError, CameraError, ImageError, ManifestError, reason_of
-from toolkit.features.features import KINDS
+from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_folders, open_descriptors, shows_upright
+from toolkit.embedders.search import VectorIndex, embedder_fingerprint, fuse, load_index, search
+from toolkit.errors import ArtifactError
+from toolkit.features.features import KINDS, SiftExtractor, usable
 from toolkit.features.matching import (
     AnyMethod,
     DeferredMethod,
     LocalMethod,
+    Verifier,
     create_local_methods,
-    resolve_auto,
-    weights_files,
+    create_methods,
+    needs_upright,
 )
 from toolkit.features.stores import FeatureStore, OnDemandFeatures, extract_session
-from toolkit.files import RAW_DATA, SceneFiles, require_current
-from toolkit.geometry import Floats, Ints
-from toolkit.manifest import LocalizeSettings
-from toolkit.manifest.settings import expand
+from toolkit.files import RAW_DATA, SceneFiles, image_name, require_current
+from toolkit.geometry import Floats, Ints, unit
+from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings
 from toolkit.mapping.build import build_map
 from toolkit.mapping.local_map import Consistency, LocalMap, map_path
-from toolkit.mapping.pose_consistency import NOMINAL_DEPTH, USUAL_DEPTHS_M
+from toolkit.mapping.pose_consistency import NOMINAL_DEPTH, remarks
 from toolkit.pose.base import (
-    CAMERA,
     NOISE,
     SEARCH_DEG,
     Localizer,
@@ -60,10 +58,10 @@ from toolkit.pose.local_triangulation import OnDemandLocalizer, PosedImages
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import RIVAL_DISTANCE, PnpLocalizer, bounded_by_rivals, clarity_of_support
 from toolkit.prediction.feed_forward import FeedForwardLocalizer, depth_of_images
-from toolkit.prediction.hybrid import HybridLocalizer, LiftingLocalizer, lifts
+from toolkit.prediction.hybrid import MOST_FEATURES, DepthLifter, HybridLocalizer, lifts
 from toolkit.prediction.interface import Predictor
 from toolkit.prediction.network import open_predictor
-from toolkit.results.metrics import UNKNOWN_UNIT, is_posed, length_unit
+from toolkit.results.metrics import UNKNOWN_UNIT, length_unit
 from toolkit.results.pair import (
     RETRIEVAL,
     SESSION_FILES,
@@ -74,46 +72,24 @@ from toolkit.results.pair import (
     last_localized,
     map_inputs,
     pairs_in_map,
+    read_settings,
 )  # fmt: skip
-from toolkit.scene.query import (
-    Image,
-    Located,
-    ReferenceSearch,
-    Retrieved,
-    camera_key,
-    guessed_camera,
-    query_from,
-    ranks,
-    show_matches,
-    with_focal,
-)
+from toolkit.scene.query import answer_of, query_from, show_matches, what_if, with_changes
 from toolkit.threads import fixed_sums
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from toolkit.figures.answers import Answer
+    from toolkit.figures.answers import Answer, Comparison
     from toolkit.viewer.queries import View3D
 
 log = logging.getLogger(__name__)
 
 WITHOUT_FEATURES = ("feed_forward", "nearest")
 """Methods that need no local features of the queries."""
-MAP_CAMERAS = 1000  # cameras of the map among which that of an image of equal size is looked for, at most
-FOCAL_STEPS, FOCAL_DOUBT = 3, 1.3
-"""Steps of the estimate of an unknown focal length; the matches must contradict one that is larger or smaller by a
-factor."""
-CENTER_DOUBT = 0.1
-"""Shift of the principal point of a cropped image, in focal lengths, that the matches must contradict, too: 6 deg."""
-FIXED_BY_MAP = ("unit", "world_up")
-"""Settings that the length of the map and the turns of its images depend on, so they cannot change for a query."""
-ODD_DEPTHS_M = (0.1, 200.0)
-"""Plausible range of a map's median depth, meters; outside, the map may be in another unit."""
 NEAR, NEAR_DEG = 10.0, 60.0
 """Largest distance (in map lengths, see `Survey.length`) and angle (degrees) between a camera and a map image that may
 show the same scene."""
-WORTH_DEG, WORTH_LENGTHS = 0.05, 0.005
-"""Noise of the map's poses, degrees and map lengths per axis, from which the user is told of it."""
 MAX_SURE_STD_M = 0.05
 """An `ok` pose with at most this standard deviation of the position, meters, is precise enough. Otherwise the fallback
 features are used too."""
@@ -121,6 +97,10 @@ FEW_REFERENCES = 4
 """How many references, those that support an `ok` pose most, fallback features are matched with at first."""
 MAX_KNOWN = 3
 """Largest number of earlier poses of a query that the fallback features judge, too."""
+MAX_IN_MEMORY = 1 << 30
+"""Largest size in bytes of global descriptors (float64) that an open map keeps in memory; larger ones stay on disk."""
+Ranked = tuple[NDArray[np.int64], NDArray[np.float64]]
+"""Rows (k,) of map images in their session, best first, and their scores (k,)."""
 
 
 @dataclass
@@ -335,7 +315,7 @@ class Map:
         # Results may be many, so they keep neither pixels of files nor features.
         views = [replace(view, _decoded={}) for view in query.views]
         lean, references = replace(query, views=views, features=[], network_matches=[]), matches.references
-        context = Located(partial(self._answer, lean, references), lambda: (self, lean, references))
+        context = Located(partial(answer_of, self, lean, references), lambda: (self, lean, references))
         return replace(result, context=context)
 
     @fixed_sums
@@ -483,7 +463,7 @@ class Map:
         """Return a result with the names of images and method; with low confidence if the map contradicts itself."""
         posed, images = result.world_from_rig is not None, tuple(view.name for view in query.views)
         method = result.found_by if posed else ""
-        if self.settings.predicts and self.settings.predictor.name == "simulated":
+        if self.settings.predictor.name == "simulated" and self.settings.predicts:
             method = f"{self.settings.method}:simulated" + (f"/{method}" if method else "")
         result = replace(result, images=images, found_by=method or self.settings.method)
         if self.consistency.trusted or not posed:
@@ -532,24 +512,6 @@ class Map:
         ]
         return replace(query, features=features, network_matches=[])
 
-    def _answer(self, query: Query, references: Sequence[References], result: QueryResult) -> "Answer":
-        from toolkit.figures.answers import Answer
-
-        return Answer(
-            result, self.settings, query.views, query.rig_from_cams, self.session, self.points,
-            length_unit(self.record()), self._true_pose(query), "query", None, ranks(self, references),
-        )  # fmt: skip
-
-    def _true_pose(self, query: Query) -> Floats | None:
-        """Return world_from_rig (4, 4) of a query of a session by its ground truth; None if that is unknown."""
-        session_id, _, path = query.views[0].name.partition("/")
-        session = self.capture[session_id] if path and session_id in self.capture else None
-        row = None if session is None else session.row_of_name.get(query.views[0].name)
-        if session is None or row is None:
-            return None
-        true = session.world_from_cam([row], ground_truth=True)[0] @ geometry.invert(query.rig_from_cams[0])
-        return true if is_posed(true) else None
-
     # What the way is made of
 
     @cached_property
@@ -572,9 +534,14 @@ class Map:
                 f"which it needs. Localize with {settings.method!r} first."
             )
         pnp = PnpLocalizer(self.in_lengths, settings.pnp, settings.seed)
+        if settings.method != "feed_forward":
+            for kind in self.in_lengths:
+                kind.load()
         if not settings.predicts:
-            of_image = depth_of_images(self.session, pnp.image_names, self.length)
-            return LiftingLocalizer(pnp, of_image) if lifts(settings, self.session) else pnp
+            if lifts(settings, self.session):
+                of_image = depth_of_images(self.session, pnp.image_names, self.length)
+                pnp.lift = DepthLifter(pnp, of_image, MOST_FEATURES).localize
+            return pnp
         predictor = self.predictor or open_predictor(settings, self.capture, self.map_dir)
         unit = ("m", 1 / self.length) if self.settings.unit else (UNKNOWN_UNIT, 1.0)
         feed_forward = FeedForwardLocalizer(
@@ -612,53 +579,10 @@ class Map:
             settings.seed,
         )
 
-    def changed(self, changes: Mapping[str, Any]) -> "Map":
-        """Return the map with changed settings of the localize stage; it shares what stays the same with this one.
-
-        If features, or the settings of the map's points, change, points are triangulated for each query from its
-        references, as the map has none of this kind.
-
-        Raises:
-            ManifestError: a setting is unknown, or the unit or the up direction of the map would change.
-            WeightsError: a network of the changed settings has no weights.
-        """
-        before, changes = self.settings, expand(LocalizeSettings, changes)
-        features = changes.get("features", {})
-        if "kinds" in features and "escalation" not in features:
-            rest = [name for name in before.features.escalation if name not in features["kinds"]]
-            changes |= {"features": {**features, "escalation": rest}}
-        try:
-            settings = LocalizeSettings.of(before, changes)
-        except ManifestError as error:
-            raise ManifestError(re.sub(r"^\w+:\s+", "localize: ", str(error))) from None
-        if fixed := [name for name in FIXED_BY_MAP if getattr(settings, name) != getattr(before, name)]:
-            raise ManifestError(
-                f"localize.{fixed[0]}: cannot change for one query, as the whole map depends on it. "
-                f"To change it: {COMMAND} run MANIFEST --set localize.{fixed[0]}=..."
-            )
-        other = copy.copy(self)
-        other.settings, other.original = settings, self._first
-        for name in ("localizer", "fallback", "index_of", "in_lengths", "points", "_world_from_cams"):
-            other.__dict__.pop(name, None)
-        if settings.map != before.map and not settings.predicts:
-            other.mapped = []
-        anew = settings.features != before.features or settings.matcher != before.matcher
-        if anew or not self.kinds:
-            kinds, other.escalation = create_methods(resolve_auto(settings))
-            extracted = {kind.name: kind.extractor.settings for kind in self.kinds}
-            kept = {kind.name: kind for kind in kinds if extracted.get(kind.name) == kind.extractor.settings}
-            other.mapped = [
-                MappedFeatures(kind.map, kind.features, kind.name, kept[kind.name].matcher)
-                for kind in other.mapped
-                if kind.name in kept
-            ]
-            mapped = [kind.name for kind in other.mapped]
-            other.kinds = sorted(kinds, key=lambda kind: kind.name not in mapped)  # as `OnDemandLocalizer` wants them
-            other.__dict__.pop("_on_demand", None)
-        return other
+    changed = with_changes
 
     @cached_property
-    def search(self) -> ReferenceSearch:
+    def search(self) -> "ReferenceSearch":
         """The embedders and descriptors of the run.
 
         Raises:
@@ -739,27 +663,8 @@ class Map:
     @property
     def remarks(self) -> str:
         """Warnings for the user about the map; empty if there are none, or if the map has no points."""
-        if self._first is None:
-            return ""
-        parts, depth = [self.consistency.text, self._noise], self.length * USUAL_DEPTHS_M[int(self.length > 1)]
-        metric = self.settings.unit and self.length != 1 and self.consistency.verdict != "inconsistent"
-        if metric and not ODD_DEPTHS_M[0] < depth < ODD_DEPTHS_M[1]:
-            parts.append(
-                f"the median depth of the map is {depth:.3g} m: if its poses are not in meters, write `unit: null` in "
-                "the manifest, or import them with their `--unit`"
-            )
-        return "; ".join(filter(None, parts))
-
-    @property
-    def _noise(self) -> str:
-        """How good the poses are, if their noise is worth a word."""
-        noise = self.consistency
-        small = noise.rotation_noise_deg < WORTH_DEG and noise.position_noise < WORTH_LENGTHS
-        if small or not noise.trusted:  # wrong intrinsics look like noise of the poses
-            return ""
-        unit, factor = ("cm", self.length) if self.settings.unit else ("% of the median depth", 1 / NOMINAL_DEPTH)
-        rotation_deg, position = np.sqrt(3) * noise.rotation_noise_deg, np.sqrt(3) * noise.position_noise * factor
-        return f"the poses of the map are good to about {rotation_deg:.2g} deg, {100 * position:.2g} {unit}"
+        metric = bool(self.settings.unit)
+        return "" if self._first is None else remarks(self.consistency, self.length, metric)
 
     def record(self) -> dict[str, Any]:
         """Return the unit, depth, length and consistency of the map, for JSON."""
@@ -773,144 +678,224 @@ def _canonical(pose: Floats) -> Floats:
     return geometry.pose_from_qt(geometry.qt_from_pose(pose))
 
 
-def localize_image(
-    scene_map: Map,
-    image: Image | Sequence[Image],
-    camera: pycolmap.Camera | Sequence[pycolmap.Camera] | None = None,
-    rig_from_cams: NDArray[np.float64] | None = None,
-    turns: Sequence[int] | None = None,
-    near: RoughPose | None = None,
-) -> QueryResult:
-    """Localize one image, or those of a rig, as the run of the map would: `Map.query` and `Map.locate` in one call.
-
-    Without a camera, the focal length of one image is estimated from its matches. It starts at that of EXIF, at that of
-    the map's camera with equal image size, or at 1.2 times the longer side; `remark` says which one was used. If the
-    matches do not tell it, for example on a plane, the pose is `low_confidence: camera?`.
-
-    Args:
-        scene_map: an open map, see `Map.open`; it is not changed.
-        image, camera, rig_from_cams, turns: see `scene.query.query_from`.
-        near: a rough pose, if it is known; see `Map.locate`.
-
-    Raises:
-        ImageError, CameraError, ArtifactError: see `Map.query` and `Map.locate`.
-    """
-    if not isinstance(scene_map, Map):
-        raise ArtifactError(f"Found {type(scene_map).__name__} for a map, expected what `Map.open` returns.")
-    if camera is None:
-        if rig_from_cams is not None or isinstance(image, list | tuple):
-            raise CameraError("camera: found None for several images, expected a camera for each.")
-        return _UnknownFocal(scene_map, image, turns, near).estimate()[0]
-    return scene_map.locate(scene_map.query(image, camera, rig_from_cams, turns), near)
+# The references of a query, and what its results need
 
 
-def localize_images(
-    scene_map: Map, images: Sequence[Image], camera: pycolmap.Camera | None = None
-) -> list[QueryResult]:
-    """Localize images, each alone, as `localize_image` does. Without a camera, images of one camera help each other.
+class Retrieved(list[References]):
+    """The references of each image of a query. A notebook displays them as a figure."""
 
-    Those with equal size, and in EXIF equal camera and focal length, are of one camera. The median of the focal lengths
-    that matches of its `ok` images tell, weighted by inliers, is tried for the other images.
+    def __init__(self, scene_map: Map, query: Query) -> None:
+        super().__init__()
+        self._map, self._query = scene_map, query
 
-    Returns:
-        One result per image. If an image cannot be read or does not fit the camera, it is `failed`, with the reason.
+    def names(self, image: int = 0) -> list[str]:
+        """Return the names of the references of one image of the query, best first."""
+        return [self._map.localizer.image_names[index] for index in self[image].images]
 
-    Raises:
-        ArtifactError: see `localize_image`.
-    """
-    results, cameras = list[QueryResult](), dict[Any, list[tuple[int, _UnknownFocal, float | None]]]()
-    for number, image in enumerate(tqdm(images, "localize", unit="image", disable=len(images) < 2)):
-        try:
-            if camera is not None:
-                results.append(localize_image(scene_map, image, camera))
-                continue
-            unknown = _UnknownFocal(scene_map, image)
-            result, told_px = unknown.estimate()
-            results.append(result)
-            sure_px = told_px if result.status is Status.OK else None
-            cameras.setdefault(camera_key(image, unknown.camera), []).append((number, unknown, sure_px))
-        except ImageError as error:
-            results.append(QueryResult.failed(reason_of(error, f"localizing {image}")))
-    for of_camera in cameras.values():
-        sure = sorted((sure_px, number) for number, _, sure_px in of_camera if sure_px is not None)
-        if not sure:
-            continue
-        inliers = np.cumsum([results[number].num_inliers for _, number in sure])
-        focal_px, _ = sure[np.searchsorted(inliers, inliers[-1] / 2)]
-        for number, unknown, sure_px in of_camera:
-            if sure_px is not None:
-                continue
-            result = unknown.locate(focal_px)
-            if result.status.rank >= results[number].status.rank and not result.misfit:
-                text = f"focal length {focal_px:.0f} px, from {len(sure)} other photographs of its camera"
-                results[number] = replace(result, remark="; ".join(filter(None, [text, result.remark])))
-    return results
+    def _repr_html_(self) -> str:
+        from toolkit.figures.query_images import draw_query_and_references
+        from toolkit.figures.style import picture_of, zoomable
+
+        of_query = [self._paths(image) for image in range(len(self))]
+        figure = draw_query_and_references([view.image for view in self._query.views], of_query)
+        return zoomable(picture_of(figure), "references of the query")
+
+    def _paths(self, image: int) -> list[tuple[Any, float]]:
+        files = map(self._map.capture.image_path, self.names(image))
+        return list(zip(files, self[image].scores.tolist(), strict=True))
 
 
-class _UnknownFocal:
-    """An image in a map, without a camera."""
+class Located:
+    """A query in its map. What needs the map or features is opened when it is first asked for."""
 
     def __init__(
-        self, scene_map: Map, image: Image, turns: Sequence[int] | None = None, near: RoughPose | None = None
+        self,
+        answer: Callable[[QueryResult], "Answer"],
+        open_query: Callable[[], tuple[Map, Query, Sequence[References]]],
     ) -> None:
-        self.scene_map, self.image, self.turns, self.near = scene_map, image, turns, near
-        sensors = scene_map.session.sensors
-        ids = sensors.loc[sensors["sensor_type"] == "camera", "sensor_id"].head(MAP_CAMERAS)
-        known = [scene_map.session.camera(str(name)) for name in ids]
-        self.camera, self.origin, self.cropped = guessed_camera(image, known)
-        self.described: Query | None = None  # with features, while different intrinsics are tried
-
-    def locate(self, focal_px: float, right: float = 0.0, down: float = 0.0) -> QueryResult:
-        """Localize with a focal length, and the principal point moved by shares of it."""
-        camera = with_focal(self.camera, focal_px)
-        camera.principal_point_x += right * focal_px
-        camera.principal_point_y += down * focal_px
-        query = self.scene_map.query(self.image, camera, None, self.turns)
-        if sees_all(camera):  # else features depend on the focal length
-            self.described = self.described or self.scene_map.describe(query)
-            query = replace(query, features=self.described.features, descriptors=self.described.descriptors)
-        return self.scene_map.locate(query, self.near)
-
-    def estimate(self) -> tuple[QueryResult, float | None]:
-        """Localize again with the focal length that fits the matches, until none fits better.
-
-        Returns:
-            The result, and the focal length in pixels; None if the matches do not contradict the guess.
+        """`answer` returns how the query was localized, given one of its results; `open_query` what is needed to do it
+        again.
         """
-        started = time.perf_counter()
-        focal_px, told = self.camera.mean_focal_length(), False
-        result = self.locate(focal_px)
-        for _ in range(FOCAL_STEPS):
-            fitting = result.focals_px[0] if result.focals_px else np.nan
-            if not np.isfinite(fitting):
-                break
-            focal_px, told = float(fitting), True
-            result = self.locate(focal_px)
-        text = f"focal length {focal_px:.0f} px, {'which fits its matches' if told else self.origin}"
-        others: list[tuple[float, ...]] = [(focal_px * FOCAL_DOUBT, 0.0, 0.0), (focal_px / FOCAL_DOUBT, 0.0, 0.0)]
-        if self.cropped:
-            others += [(focal_px, *(sign * CENTER_DOUBT)) for sign in (*np.eye(2), *-np.eye(2))]
-        if result.status == Status.OK and not all(self.locate(*other).misfit for other in others):
-            result = replace(result, status=Status.LOW_CONFIDENCE, reason=CAMERA)
-            text += ", as other intrinsics do" if told else ", and the matches do not tell it"
-        self.described = None
-        remark, seconds = "; ".join(filter(None, [text, result.remark])), time.perf_counter() - started
-        return replace(result, remark=remark, seconds=seconds), focal_px if told else None
+        self.answer, self.open = answer, open_query
+
+    def __deepcopy__(self, memo: Any) -> "Located":
+        """Return itself: copies of a result share the map."""
+        return self
+
+    def show_3d(self, results: Sequence[QueryResult], rays: bool = False) -> "View3D":
+        """See `QueryResult.show_3d`."""
+        from toolkit.viewer.queries import View3D
+
+        return View3D.of([result.show() for result in results], rays)
+
+    @cached_property
+    def _opened(self) -> tuple[Map, Query, Sequence[References]]:
+        return self.open()
+
+    @property
+    def what_if(self) -> Callable[..., "Comparison"]:
+        """See `scene.query.what_if`; the first three arguments are given."""
+        return partial(what_if, *self._opened)
 
 
-def needs_upright(settings: LocalizeSettings, kinds: Sequence[AnyMethod]) -> bool:
-    """Tell whether a network that localizes needs upright images; `kinds` are the kinds of features."""
-    return settings.predicts or any(KINDS[kind.name].upright for kind in kinds)
+class ReferenceSearch:
+    """The embedders of a finished run, and the descriptors of its map images."""
 
+    def __init__(self, files: SceneFiles, session: Session, reranked: bool) -> None:
+        """Take the files of the run, the map session, and whether the run localized with reranked references."""
+        self.files, self.session, self.reranked = files, session, reranked
 
-def create_methods(settings: LocalizeSettings) -> tuple[list[LocalMethod], list[DeferredMethod]]:
-    """Return the kinds of features that every query needs, and those for queries without a sure pose.
+    def load(self) -> None:
+        """Load what all queries share, before several threads find it missing: `cached_property` has no lock."""
+        _ = self.embedders, self._descriptors, self._index
+        if self.reranked:
+            _ = self._verification
 
-    Raise WeightsError if a network has no weights.
-    """
-    if settings.method == "nearest":
-        return [], []
-    further = settings.features.escalation if settings.method in ("pnp", "hybrid") else []
-    if further:
-        weights_files(settings)
-    return create_local_methods(settings), [DeferredMethod(settings, name) for name in further]
+    @property
+    def shows_upright(self) -> bool:
+        """Whether the run turned images upright for an embedder, or for the features that it reranked with."""
+        upright = any(shows_upright(embedder, self.embed_settings.upright) for embedder in self.embedders)
+        return upright or (self.reranked and KINDS[self._verification[0].name].upright)
+
+    def describe(self, query: Query, kinds: Sequence[LocalMethod]) -> list[NDArray[np.float32]]:
+        """Return for each embedder the global descriptors (C, D) of a query's images; `kinds` are its features."""
+        return [embedder.embed(self._inputs(embedder, query, kinds)) for embedder in self.embedders]
+
+    def _inputs(self, embedder: Embedder, query: Query, kinds: Sequence[LocalMethod]) -> list[Any]:
+        if embedder.inputs != "features":
+            turned, side = shows_upright(embedder, self.embed_settings.upright), embedder.least_side
+            images = (turn_image(view.read(True, side), view.turns if turned else 0) for view in query.views)
+            return [embedder.prepare(image) for image in images]
+        sift, settings = self._sift, [kind.extractor.settings for kind in kinds]
+        if query.features and sift.settings in settings:  # the embedder can use the features of the localizer
+            at = settings.index(sift.settings)
+            return [features[at] for features in query.features if not isinstance(features, str)]
+        extracted = sift.extract([view.read(color=False) for view in query.views])
+        views = zip(extracted, query.views, strict=True)
+        return [usable(features, view.mask, view.camera) for features, view in views]
+
+    @cached_property
+    def _sift(self) -> SiftExtractor:
+        return SiftExtractor()
+
+    def find(
+        self, query: Query, k: int | None = None, allowed: Sequence[NDArray[np.bool_] | None] = ()
+    ) -> list[Ranked]:
+        """Return the references of each image of a query with the descriptors of `describe`, as the run would find
+        them.
+
+        By default, there are `k` as in the run; `allowed` has, for each image, a mask over the rows `rows`, or None.
+        Raise ArtifactError if the map was embedded by another embedder.
+        """
+        for embedder, described, dim in zip(self.embedders, query.descriptors, self._stored[0].dims, strict=True):
+            if described.shape[1] != dim:
+                raise ArtifactError(
+                    f"{self.files.embeddings}: found descriptors of {dim} dimensions for the map, expected "
+                    f"{described.shape[1]} of {embedder.name}. Run the embed stage again."
+                )
+        searched = np.hstack([self._as_searched(vectors) for vectors in query.descriptors])
+        topk = self.retrieve_settings.topk if k is None or self.reranked else k
+        masks = list(allowed) or [None] * len(searched)
+        ranked = [self._nearest(vector, topk, mask) for vector, mask in zip(searched, masks, strict=True)]
+        if self.reranked:
+            ranked = [self._rerank(of_image, view) for of_image, view in zip(ranked, query.views, strict=True)]
+        return [(of_image[:k], scores[:k]) for of_image, scores in ranked]
+
+    def _nearest(self, vector: NDArray[np.float32], k: int, allowed: NDArray[np.bool_] | None) -> Ranked:
+        """Return the k map images that are most similar to a vector, with the scores and in the order of `search`."""
+        of_map, rows, dims = self._descriptors, self.rows, self._stored[0].dims
+        if self._index is not None or isinstance(of_map, Vectors):
+            found = search(vector[None], of_map, k, "torch", "cpu", index=self._index, allowed=allowed, dims=dims)
+            scores, nearest = (of_vector[0, found[1][0] >= 0] for of_vector in found)
+            return rows[nearest], scores.astype(np.float64)
+        ends = np.cumsum(dims)[:-1]
+        parts = zip(np.split(of_map, ends, axis=1), np.split(vector.astype(np.float64), ends), strict=True)
+        products = [np.einsum("nd,d->n", descriptors, described) for descriptors, described in parts]
+        scores = (products[0] if len(products) == 1 else fuse(products)).astype(np.float32)
+        if not np.isfinite(scores).all():
+            raise ValueError("The descriptors of the query or of the map have NaN or infinite values.")
+        candidates = np.arange(len(rows)) if allowed is None else np.flatnonzero(allowed)
+        nearest = candidates[np.argsort(-scores[candidates], kind="stable")[:k]]
+        return rows[nearest], scores[nearest].astype(np.float64)
+
+    def _rerank(self, ranked: Ranked, view: View) -> Ranked:
+        """Return rows of map images and their numbers of verified matches, most first, as the rerank stage does."""
+        method, verifier = self._verification
+        rows = ranked[0][: verifier.settings.topn]
+        names = [self.session.image_name(int(row)) for row in rows]
+        verified, _ = verifier.verify(view.extract(method), view.camera, names, self.session.cameras(rows))
+        order = np.argsort(-np.array(verified), kind="stable")[: verifier.settings.topk]
+        return rows[order], np.array(verified, np.float64)[order]
+
+    def _as_searched(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return descriptors normalized and rounded like those of the map, which were written to a file."""
+        if self.embed_settings.normalize:
+            vectors = unit(vectors)
+        vectors = vectors.astype(self.embed_settings.dtype).astype(np.float32)
+        return unit(vectors) if self.retrieve_settings.normalize else vectors
+
+    @property
+    def rows(self) -> NDArray[np.int64]:
+        """Rows (N,) of the map images that are searched, in the session."""
+        return self._stored[1]
+
+    @cached_property
+    def embed_settings(self) -> EmbedSettings:
+        return read_settings(self.files.embeddings / "settings.json", EmbedSettings)
+
+    @cached_property
+    def retrieve_settings(self) -> RetrieveSettings:
+        return read_settings(self.files.retrieval_dir / "settings.json", RetrieveSettings)
+
+    @cached_property
+    def embedders(self) -> list[Embedder]:
+        """The embedders that the run used; ArtifactError is raised if the map's vectors are from another one."""
+        settings = self.embed_settings
+        folders = embedding_folders(self.files.embeddings).values()
+        learned = {
+            "checkpoint": settings.checkpoint,
+            "device": settings.compute_device,
+            "dtype_compute": settings.dtype_compute,
+            "image_size": settings.image_size,
+        }
+        embedders = [
+            create_embedder(name, **({"vocabulary": folder / "vlad.npz"} if name == "vlad" else learned))
+            for name, folder in zip(settings.models, folders, strict=True)
+        ]
+        for embedder, vectors in zip(embedders, self._stored[0].parts.values(), strict=True):
+            if vectors.embedder not in ("", embedder_fingerprint(embedder.settings)):
+                raise ArtifactError(
+                    f"{vectors.paths[0]} was made by another embedder or vocabulary than the run's {embedder.name} of "
+                    "now. Run the embed stage again."
+                )
+        return embedders
+
+    @cached_property
+    def _stored(self) -> tuple[Vectors, NDArray[np.int64]]:
+        """Global descriptors (N, D) of the posed map images, on disk, as they are searched; rows of the images (N,)."""
+        normalize = self.retrieve_settings.normalize
+        vectors, table = open_descriptors(self.files.embeddings, self.session.id, normalize)
+        rows = np.array([self.session.row_of_name[image_name(path)] for path in table["abs_path"]], np.int64)
+        posed = np.isfinite(self.session.world_from_cam(rows)).reshape(-1, 16).all(axis=1)
+        return vectors.choose(np.flatnonzero(posed)), rows[posed]
+
+    @cached_property
+    def _descriptors(self) -> Floats | Vectors:
+        """Those of `_stored`, in memory unless the map is large."""
+        vectors = self._stored[0]
+        in_memory = np.dtype(np.float64).itemsize * vectors.shape[1] * len(vectors) < MAX_IN_MEMORY
+        return vectors[:].astype(np.float64) if in_memory else vectors
+
+    @cached_property
+    def _index(self) -> VectorIndex | None:
+        """The index of the descriptors, if the run has one."""
+        settings = self.retrieve_settings.model_copy(update={"faiss_gpu": False})  # this machine may have no GPU
+        return load_index(self.files.embeddings, self.session.id, self._stored[0], settings)
+
+    @cached_property
+    def _verification(self) -> tuple[LocalMethod, Verifier]:
+        """Features and verifier of the run's rerank stage."""
+        settings = read_settings(self.files.reranked_dir / "settings.json", RerankSettings)
+        (method,) = create_local_methods(settings)
+        store = FeatureStore.of_session(self.files.features, self.session.id, method.extractor.settings)
+        return method, Verifier(settings, method.matcher, store)

@@ -1,12 +1,12 @@
-"""A query from any images with cameras, and checks of what a person gives; the references of an image in the map of a
-finished run, found as its stages embed, retrieve and rerank do; and what references, matches and results need to show
+"""A query from any images with cameras, and checks of what a person gives; and what matches and results need to show
 themselves, and to be tried with changes.
 """
 
+import copy
 import operator
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from toolkit.capture import Session
+from toolkit import geometry
 from toolkit.capture.images import (
     GuessedCamera,
     camera_text,
@@ -24,28 +24,23 @@ from toolkit.capture.images import (
     parse_camera,
     read_header,
     stored_size,
-    turn_image,
 )
-from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_folders, open_descriptors, shows_upright
-from toolkit.embedders.search import VectorIndex, embedder_fingerprint, load_index, search
 from toolkit.errors import COMMAND, ArtifactError, CameraError, ImageError, ManifestError
-from toolkit.features.features import KINDS, SiftExtractor, usable
-from toolkit.features.matching import LocalMethod, Verifier, create_local_methods
-from toolkit.features.stores import FeatureStore
-from toolkit.files import SceneFiles, image_name
-from toolkit.geometry import Floats, unit
-from toolkit.manifest import EmbedSettings, RerankSettings, RetrieveSettings, nearest
+from toolkit.features.matching import create_methods, resolve_auto
+from toolkit.geometry import Floats
+from toolkit.manifest import LocalizeSettings, nearest
 from toolkit.manifest.manifest import nested
+from toolkit.manifest.settings import expand
 from toolkit.pose.base import Query, QueryMatches, QueryResult, References, RoughPose, View
+from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpMatches
 from toolkit.results.localized import ShownImage
-from toolkit.results.pair import read_settings
+from toolkit.results.metrics import is_posed, length_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from toolkit.figures.answers import Answer, Comparison
-    from toolkit.viewer.queries import View3D
 
 _MAX_DEVIATION = 1e-3
 """Largest deviation of R @ R.T from the identity for a rotation R; rounding to float32 or in files stays below."""
@@ -54,12 +49,10 @@ Image = Any
 """A file (str, Path), or pixels as `pixels_from` takes them."""
 Map = Any
 """A `scene.map.Map`, which imports this module."""
+FIXED_BY_MAP = ("unit", "world_up")
+"""Settings that the length of the map and the turns of its images depend on, so they cannot change for a query."""
 CHANGEABLE = ("localize", "retrieve.topk")
 """Sections and keys of a manifest that can be changed for one query."""
-MAX_IN_MEMORY = 1 << 30
-"""Largest size in bytes of global descriptors (float32) that an open map keeps in memory; larger ones stay on disk."""
-Ranked = tuple[NDArray[np.int64], NDArray[np.float64]]
-"""Rows (k,) of map images in their session, best first, and their scores (k,)."""
 
 
 def query_from(
@@ -222,132 +215,150 @@ def _turns(turns: Any) -> list[int]:
 # A query in its map
 
 
-class Retrieved(list[References]):
-    """The references of each image of a query. A notebook displays them as a figure."""
+def what_if(
+    scene_map: Map,
+    query: Query,
+    found: Sequence[References],
+    result: QueryResult,
+    changes: Mapping[str, Any],
+    *,
+    references: Sequence[str] | None = None,
+    drop: Sequence[int | str] = (),
+    focal_px: float | None = None,
+    camera: pycolmap.Camera | None = None,
+    near: RoughPose | None = None,
+) -> "Comparison":
+    """Localize the query again with something changed. Nothing is written.
 
-    def __init__(self, scene_map: Map, query: Query, references: Sequence[References] = ()) -> None:
-        super().__init__(references)
-        self._map, self._query = scene_map, query
+    Args:
+        scene_map, query, found: the map, the query, and the references of its images.
+        result: the result to compare with.
+        changes: settings by their keys in the manifest: `{"localize.pnp.max_error_deg": 0.1, "retrieve.topk": 5}`.
+            Points of features that the map does not have, or of other settings of the map, are triangulated from
+            the references of this query.
+        references: names of map images, or unique ends of names, to use instead of the retrieved ones.
+        drop: references to leave out, by rank from 1, or by name.
+        focal_px: focal length of the query's cameras, pixels.
+        camera: intrinsics of the query's images.
+        near: a rough pose of the query.
 
-    def names(self, image: int = 0) -> list[str]:
-        """Return the names of the references of one image of the query, best first."""
-        return [self._map.localizer.image_names[index] for index in self[image].images]
+    Returns:
+        The answer before and the one after.
 
-    def _repr_html_(self) -> str:
-        from toolkit.figures.query_images import draw_query_and_references
-        from toolkit.figures.style import picture_of, zoomable
+    Raises:
+        ManifestError: a setting does not exist, or cannot change for one query.
+        ArtifactError: no map image has a name; or features, weights or files of the run are missing.
+        CameraError: the camera does not fit the image.
+    """
+    from toolkit.figures.answers import Comparison
 
-        of_query = [self._paths(image) for image in range(len(self))]
-        figure = draw_query_and_references([view.image for view in self._query.views], of_query)
-        return zoomable(picture_of(figure), "references of the query")
+    sections = nested(changes)
+    for section in sections.keys() - {"localize", "retrieve"}:
+        raise ManifestError(
+            f"{section}: cannot change for one query. {nearest(section, CHANGEABLE)} "
+            f"To change it for all queries: {COMMAND} run MANIFEST --set {section}..."
+        )
+    retrieval = dict(sections.get("retrieve", {}))
+    k = retrieval.pop("topk", None)
+    if retrieval or not (k is None or (isinstance(k, int) and k > 0)):
+        raise ManifestError.at("retrieve", sections["retrieve"], "topk alone, above 0, for one query")
+    other = scene_map.changed(sections.get("localize", {}))
+    cameras = [camera or view.camera for view in query.views]
+    if camera is not None or focal_px is not None:
+        cameras = cameras if focal_px is None else [with_focal(one, focal_px) for one in cameras]
+        views = [replace(view, camera=one) for view, one in zip(query.views, cameras, strict=True)]
+        query = replace(query, views=views)
+    if k is not None:
+        found = scene_map.retrieve(query, k)
+    extracted = [[kind.extractor.settings for kind in of_map.kinds] for of_map in (scene_map, other)]
+    query = replace(query, features=query.features if extracted[0] == extracted[1] else [], network_matches=[])
+    if references is not None:
+        images = [scene_map.find_image(name) for name in references]
+        found = [References.of(images)] * len(query.views)
+    dropped = [scene_map.find_image(name) for name in drop if not isinstance(name, int)]
+    at = [rank - 1 for rank in drop if isinstance(rank, int)]
+    found = [
+        retrieved.take(~np.isin(retrieved.images, dropped) & ~np.isin(np.arange(len(retrieved.images)), at))
+        for retrieved in found
+    ]
+    again = other.locate(query, near, [_in(other, scene_map, retrieved) for retrieved in found])
+    said = {
+        "references": references,
+        "drop": list(drop),
+        "focal_px": focal_px,
+        "camera": camera and f"{camera.model_name} {camera.params_to_string()}",
+        "near": near and "a rough pose",
+    }
+    before, retrieved = result.show(), ranks(scene_map, found)
+    after = replace(before, result=again, settings=other.settings, views=query.views, retrieved=retrieved)
+    return Comparison(before, after, {**changes, **{name: value for name, value in said.items() if value}})
 
-    def _paths(self, image: int) -> list[tuple[Any, float]]:
-        files = map(self._map.capture.image_path, self.names(image))
-        return list(zip(files, self[image].scores.tolist(), strict=True))
 
+def with_changes(scene_map: Map, changes: Mapping[str, Any]) -> Map:
+    """Return a map with changed settings of the localize stage; it shares what stays the same with the given one.
 
-class Located:
-    """A query in its map. What needs the map or features is opened when it is first asked for."""
+    If features, or the settings of the map's points, change, points are triangulated for each query from its
+    references, as the map has none of this kind.
 
-    def __init__(
-        self,
-        answer: Callable[[QueryResult], "Answer"],
-        open_query: Callable[[], tuple[Map, Query, Sequence[References]]],
-    ) -> None:
-        """`answer` returns how the query was localized, given one of its results; `open_query` what is needed to do it
-        again.
-        """
-        self.answer, self.open = answer, open_query
-
-    def __deepcopy__(self, memo: Any) -> "Located":
-        """Return itself: copies of a result share the map."""
-        return self
-
-    @cached_property
-    def _opened(self) -> tuple[Map, Query, Sequence[References]]:
-        return self.open()
-
-    def show_3d(self, results: Sequence[QueryResult], rays: bool = False) -> "View3D":
-        """See `QueryResult.show_3d`."""
-        from toolkit.viewer.queries import View3D
-
-        return View3D.of([result.show() for result in results], rays)
-
-    def what_if(
-        self,
-        result: QueryResult,
-        changes: Mapping[str, Any],
-        *,
-        references: Sequence[str] | None = None,
-        drop: Sequence[int | str] = (),
-        focal_px: float | None = None,
-        camera: pycolmap.Camera | None = None,
-        near: RoughPose | None = None,
-    ) -> "Comparison":
-        """Localize the query again with something changed. Nothing is written.
-
-        Args:
-            result: the result to compare with.
-            changes: settings by their keys in the manifest: `{"localize.pnp.max_error_deg": 0.1, "retrieve.topk": 5}`.
-                Points of features that the map does not have, or of other settings of the map, are triangulated from
-                the references of this query.
-            references: names of map images, or unique ends of names, to use instead of the retrieved ones.
-            drop: references to leave out, by rank from 1, or by name.
-            focal_px: focal length of the query's cameras, pixels.
-            camera: intrinsics of the query's images.
-            near: a rough pose of the query.
-
-        Returns:
-            The answer before and the one after.
-
-        Raises:
-            ManifestError: a setting does not exist, or cannot change for one query.
-            ArtifactError: no map image has a name; or features, weights or files of the run are missing.
-            CameraError: the camera does not fit the image.
-        """
-        from toolkit.figures.answers import Comparison
-
-        scene_map, query, found = self._opened
-        sections = nested(changes)
-        for section in sections.keys() - {"localize", "retrieve"}:
-            raise ManifestError(
-                f"{section}: cannot change for one query. {nearest(section, CHANGEABLE)} "
-                f"To change it for all queries: {COMMAND} run MANIFEST --set {section}..."
-            )
-        retrieval = dict(sections.get("retrieve", {}))
-        k = retrieval.pop("topk", None)
-        if retrieval or not (k is None or (isinstance(k, int) and k > 0)):
-            raise ManifestError.at("retrieve", sections["retrieve"], "topk alone, above 0, for one query")
-        other = scene_map.changed(sections.get("localize", {}))
-        cameras = [camera or view.camera for view in query.views]
-        if camera is not None or focal_px is not None:
-            cameras = cameras if focal_px is None else [with_focal(one, focal_px) for one in cameras]
-            views = [replace(view, camera=one) for view, one in zip(query.views, cameras, strict=True)]
-            query = replace(query, views=views)
-        if k is not None:
-            found = scene_map.retrieve(query, k)
-        extracted = [[kind.extractor.settings for kind in of_map.kinds] for of_map in (scene_map, other)]
-        query = replace(query, features=query.features if extracted[0] == extracted[1] else [], network_matches=[])
-        if references is not None:
-            images = [scene_map.find_image(name) for name in references]
-            found = [References.of(images)] * len(query.views)
-        dropped = [scene_map.find_image(name) for name in drop if not isinstance(name, int)]
-        at = [rank - 1 for rank in drop if isinstance(rank, int)]
-        found = [
-            retrieved.take(~np.isin(retrieved.images, dropped) & ~np.isin(np.arange(len(retrieved.images)), at))
-            for retrieved in found
+    Raises:
+        ManifestError: a setting is unknown, or the unit or the up direction of the map would change.
+        WeightsError: a network of the changed settings has no weights.
+    """
+    before, changes = scene_map.settings, expand(LocalizeSettings, changes)
+    features = changes.get("features", {})
+    if "kinds" in features and "escalation" not in features:
+        rest = [name for name in before.features.escalation if name not in features["kinds"]]
+        changes |= {"features": {**features, "escalation": rest}}
+    try:
+        settings = LocalizeSettings.of(before, changes)
+    except ManifestError as error:
+        raise ManifestError(re.sub(r"^\w+:\s+", "localize: ", str(error))) from None
+    if fixed := [name for name in FIXED_BY_MAP if getattr(settings, name) != getattr(before, name)]:
+        raise ManifestError(
+            f"localize.{fixed[0]}: cannot change for one query, as the whole map depends on it. "
+            f"To change it: {COMMAND} run MANIFEST --set localize.{fixed[0]}=..."
+        )
+    other = copy.copy(scene_map)
+    other.settings, other.original = settings, scene_map._first
+    for name in ("localizer", "fallback", "index_of", "in_lengths", "points", "_world_from_cams"):
+        other.__dict__.pop(name, None)
+    if settings.map != before.map and not settings.predicts:
+        other.mapped = []
+    anew = settings.features != before.features or settings.matcher != before.matcher
+    if anew or not scene_map.kinds:
+        kinds, other.escalation = create_methods(resolve_auto(settings))
+        extracted = {kind.name: kind.extractor.settings for kind in scene_map.kinds}
+        kept = {kind.name: kind for kind in kinds if extracted.get(kind.name) == kind.extractor.settings}
+        other.mapped = [
+            MappedFeatures(kind.map, kind.features, kind.name, kept[kind.name].matcher)
+            for kind in other.mapped
+            if kind.name in kept
         ]
-        again = other.locate(query, near, [_in(other, scene_map, retrieved) for retrieved in found])
-        said = {
-            "references": references,
-            "drop": list(drop),
-            "focal_px": focal_px,
-            "camera": camera and f"{camera.model_name} {camera.params_to_string()}",
-            "near": near and "a rough pose",
-        }
-        before, retrieved = self.answer(result), ranks(scene_map, found)
-        after = replace(before, result=again, settings=other.settings, views=query.views, retrieved=retrieved)
-        return Comparison(before, after, {**changes, **{name: value for name, value in said.items() if value}})
+        mapped = [kind.name for kind in other.mapped]
+        other.kinds = sorted(kinds, key=lambda kind: kind.name not in mapped)  # as `OnDemandLocalizer` wants them
+        other.__dict__.pop("_on_demand", None)
+    return other
+
+
+def answer_of(scene_map: Map, query: Query, references: Sequence[References], result: QueryResult) -> "Answer":
+    """Return how a query was localized in a map, given one of its results."""
+    from toolkit.figures.answers import Answer
+
+    return Answer(
+        result, scene_map.settings, query.views, query.rig_from_cams, scene_map.session, scene_map.points,
+        length_unit(scene_map.record()), _true_pose(scene_map, query), "query", None, ranks(scene_map, references),
+    )  # fmt: skip
+
+
+def _true_pose(scene_map: Map, query: Query) -> Floats | None:
+    """Return world_from_rig (4, 4) of a query of a session by its ground truth; None if that is unknown."""
+    session_id, _, path = query.views[0].name.partition("/")
+    session = scene_map.capture[session_id] if path and session_id in scene_map.capture else None
+    row = None if session is None else session.row_of_name.get(query.views[0].name)
+    if session is None or row is None:
+        return None
+    true: Floats = session.world_from_cam([row], ground_truth=True)[0] @ geometry.invert(query.rig_from_cams[0])
+    return true if is_posed(true) else None
 
 
 def ranks(scene_map: Map, references: Sequence[References]) -> dict[str, tuple[int, float]]:
@@ -403,161 +414,3 @@ def show_matches(scene_map: Map, matches: QueryMatches, rank: int, image: int) -
     reference = shown(name, scene_map.session.image_path(row), scene_map.session.cameras([row])[0], pixels)
     query = shown(view.name, view.image, view.camera, of_pair.pixels[seen])
     return draw_pair(query, reference, f"{len(seen)} matches by descriptors with reference {rank}")
-
-
-# The search for references
-
-
-class ReferenceSearch:
-    """The embedders of a finished run, and the descriptors of its map images."""
-
-    def __init__(self, files: SceneFiles, session: Session, reranked: bool) -> None:
-        """Take the files of the run, the map session, and whether the run localized with reranked references."""
-        self.files, self.session, self.reranked = files, session, reranked
-
-    def load(self) -> None:
-        """Load what all queries share, before several threads find it missing: `cached_property` has no lock."""
-        _ = self.embedders, self._descriptors, self._index
-        if self.reranked:
-            _ = self._verification
-
-    @property
-    def shows_upright(self) -> bool:
-        """Whether the run turned images upright for an embedder, or for the features that it reranked with."""
-        upright = any(shows_upright(embedder, self.embed_settings.upright) for embedder in self.embedders)
-        return upright or (self.reranked and KINDS[self._verification[0].name].upright)
-
-    def describe(self, query: Query, kinds: Sequence[LocalMethod]) -> list[NDArray[np.float32]]:
-        """Return for each embedder the global descriptors (C, D) of a query's images; `kinds` are its features."""
-        return [embedder.embed(self._inputs(embedder, query, kinds)) for embedder in self.embedders]
-
-    def _inputs(self, embedder: Embedder, query: Query, kinds: Sequence[LocalMethod]) -> list[Any]:
-        if embedder.inputs != "features":
-            turned, side = shows_upright(embedder, self.embed_settings.upright), embedder.least_side
-            images = (turn_image(view.read(True, side), view.turns if turned else 0) for view in query.views)
-            return [embedder.prepare(image) for image in images]
-        sift, settings = self._sift, [kind.extractor.settings for kind in kinds]
-        if query.features and sift.settings in settings:  # the embedder can use the features of the localizer
-            at = settings.index(sift.settings)
-            return [features[at] for features in query.features if not isinstance(features, str)]
-        extracted = sift.extract([view.read(color=False) for view in query.views])
-        views = zip(extracted, query.views, strict=True)
-        return [usable(features, view.mask, view.camera) for features, view in views]
-
-    @cached_property
-    def _sift(self) -> SiftExtractor:
-        return SiftExtractor()
-
-    def find(
-        self, query: Query, k: int | None = None, allowed: Sequence[NDArray[np.bool_] | None] = ()
-    ) -> list[Ranked]:
-        """Return the references of each image of a query with the descriptors of `describe`, as the run would find
-        them.
-
-        By default, there are `k` as in the run; `allowed` has, for each image, a mask over the rows `rows`, or None.
-        Raise ArtifactError if the map was embedded by another embedder.
-        """
-        stored, rows = self._stored
-        dims = stored.dims
-        for embedder, described, dim in zip(self.embedders, query.descriptors, dims, strict=True):
-            if described.shape[1] != dim:
-                raise ArtifactError(
-                    f"{self.files.embeddings}: found descriptors of {dim} dimensions for the map, expected "
-                    f"{described.shape[1]} of {embedder.name}. Run the embed stage again."
-                )
-        searched = np.hstack([self._as_searched(vectors) for vectors in query.descriptors])
-        topk = self.retrieve_settings.topk if k is None or self.reranked else k
-        masks = list(allowed) or [None]
-        results = [
-            search(part, self._descriptors, topk, "torch", "cpu", index=self._index, allowed=mask, dims=dims)
-            for part, mask in zip(np.split(searched, len(masks)), masks, strict=True)
-        ]
-        all_scores, neighbors = (np.concatenate(arrays) for arrays in zip(*results, strict=True))
-        ranked = [
-            (rows[indices[indices >= 0]], scores[indices >= 0].astype(np.float64))
-            for indices, scores in zip(neighbors, all_scores, strict=True)
-        ]
-        if self.reranked:
-            ranked = [self._rerank(of_image, view) for of_image, view in zip(ranked, query.views, strict=True)]
-        return [(of_image[:k], scores[:k]) for of_image, scores in ranked]
-
-    def _rerank(self, ranked: Ranked, view: View) -> Ranked:
-        """Return rows of map images and their numbers of verified matches, most first, as the rerank stage does."""
-        method, verifier = self._verification
-        rows = ranked[0][: verifier.settings.topn]
-        names = [self.session.image_name(int(row)) for row in rows]
-        verified, _ = verifier.verify(view.extract(method), view.camera, names, self.session.cameras(rows))
-        order = np.argsort(-np.array(verified), kind="stable")[: verifier.settings.topk]
-        return rows[order], np.array(verified, np.float64)[order]
-
-    def _as_searched(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return descriptors normalized and rounded like those of the map, which were written to a file."""
-        if self.embed_settings.normalize:
-            vectors = unit(vectors)
-        vectors = vectors.astype(self.embed_settings.dtype).astype(np.float32)
-        return unit(vectors) if self.retrieve_settings.normalize else vectors
-
-    @property
-    def rows(self) -> NDArray[np.int64]:
-        """Rows (N,) of the map images that are searched, in the session."""
-        return self._stored[1]
-
-    @cached_property
-    def embed_settings(self) -> EmbedSettings:
-        return read_settings(self.files.embeddings / "settings.json", EmbedSettings)
-
-    @cached_property
-    def retrieve_settings(self) -> RetrieveSettings:
-        return read_settings(self.files.retrieval_dir / "settings.json", RetrieveSettings)
-
-    @cached_property
-    def embedders(self) -> list[Embedder]:
-        """The embedders that the run used; ArtifactError is raised if the map's vectors are from another one."""
-        settings = self.embed_settings
-        folders = embedding_folders(self.files.embeddings).values()
-        learned = {
-            "checkpoint": settings.checkpoint,
-            "device": settings.compute_device,
-            "dtype_compute": settings.dtype_compute,
-            "image_size": settings.image_size,
-        }
-        embedders = [
-            create_embedder(name, **({"vocabulary": folder / "vlad.npz"} if name == "vlad" else learned))
-            for name, folder in zip(settings.models, folders, strict=True)
-        ]
-        for embedder, vectors in zip(embedders, self._stored[0].parts.values(), strict=True):
-            if vectors.embedder not in ("", embedder_fingerprint(embedder.settings)):
-                raise ArtifactError(
-                    f"{vectors.paths[0]} was made by another embedder or vocabulary than the run's {embedder.name} of "
-                    "now. Run the embed stage again."
-                )
-        return embedders
-
-    @cached_property
-    def _stored(self) -> tuple[Vectors, NDArray[np.int64]]:
-        """Global descriptors (N, D) of the posed map images, on disk, as they are searched; rows of the images (N,)."""
-        normalize = self.retrieve_settings.normalize
-        vectors, table = open_descriptors(self.files.embeddings, self.session.id, normalize)
-        rows = np.array([self.session.row_of_name[image_name(path)] for path in table["abs_path"]], np.int64)
-        posed = np.isfinite(self.session.world_from_cam(rows)).reshape(-1, 16).all(axis=1)
-        return vectors.choose(np.flatnonzero(posed)), rows[posed]
-
-    @cached_property
-    def _descriptors(self) -> NDArray[np.float32] | Vectors:
-        """Those of `_stored`, in memory unless the map is large."""
-        vectors = self._stored[0]
-        return vectors[:] if 4 * vectors.shape[1] * len(vectors) < MAX_IN_MEMORY else vectors
-
-    @cached_property
-    def _index(self) -> VectorIndex | None:
-        """The index of the descriptors, if the run has one."""
-        settings = self.retrieve_settings.model_copy(update={"faiss_gpu": False})  # this machine may have no GPU
-        return load_index(self.files.embeddings, self.session.id, self._stored[0], settings)
-
-    @cached_property
-    def _verification(self) -> tuple[LocalMethod, Verifier]:
-        """Features and verifier of the run's rerank stage."""
-        settings = read_settings(self.files.reranked_dir / "settings.json", RerankSettings)
-        (method,) = create_local_methods(settings)
-        store = FeatureStore.of_session(self.files.features, self.session.id, method.extractor.settings)
-        return method, Verifier(settings, method.matcher, store)

@@ -49,8 +49,8 @@ from toolkit.results.pair import (
 )
 from toolkit.runs.folder import RECORD
 from toolkit.runs.kernel import TEXT_BARS
-from toolkit.scene.map import WITHOUT_FEATURES, Map
-from toolkit.scene.query import Located, best_ranks
+from toolkit.scene.map import WITHOUT_FEATURES, Located, Map
+from toolkit.scene.query import best_ranks
 
 if TYPE_CHECKING:
     from toolkit.figures.answers import Answer
