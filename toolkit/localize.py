@@ -482,7 +482,7 @@ class _Pair:
         if retry_s is None:
             results = self._run(self._locate, self._predicted(list(of_number)), len(todo))
         else:
-            results = self._run(self.map.retry, retried(), len(todo))
+            results = self._run(self._retry, retried(), len(todo))
         for number, result in results:
             if result.is_internal:
                 faulty[number] = result
@@ -516,6 +516,11 @@ class _Pair:
 
     def _locate(self, query: Query, references: Sequence[References], prediction: Any) -> QueryResult:
         return self.map.locate(query, None, references, prediction, fallback=False)
+
+    def _retry(self, query: Query, references: Sequence[References], first: QueryResult) -> QueryResult:
+        started = time.perf_counter()
+        result = self.map.retry(query, self.map.match(query, references, self.map.fallback), first)
+        return replace(result, seconds=first.seconds + time.perf_counter() - started)
 
     def _predicted(self, numbers: Sequence[int]) -> Iterator[_Task]:
         """Yield queries with the predictions of a network, which runs on batches of queries."""

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pycolmap
@@ -176,6 +177,19 @@ def test_matches_from_a_file_lack_what_could_not_be_read() -> None:
 
     query = replace(scene.query, network_matches=[[pairs.__getitem__]])
     assert_right(scene.localizer(source=source).localize(query, scene.references))
+
+
+def test_references_that_are_known_are_not_matched_again() -> None:
+    """The fallback features ask few references first, then all: those of the first round went through the network."""
+    scene, matcher = Scene(), Mock(wraps=ByPoint())
+    localizer = scene.localizer(matcher=matcher)
+    number_of = {id(scene.features[name]): number for number, name in enumerate(scene.names)}
+    few = localizer.match(scene.query, [References.of([1, 4])])
+    with_all = localizer.match(replace(scene.query, network_matches=few.query.network_matches), scene.references)
+    asked = [[number_of[id(pair[1])] for pair in call.args[0]] for call in matcher.match.call_args_list]
+    assert asked == [[1, 4], [0, 2, 3, 5]]
+    in_one = scene.localizer().localize(scene.query, scene.references)
+    np.testing.assert_array_equal(localizer.solve(with_all).world_from_rig, in_one.world_from_rig)
 
 
 def test_without_references_there_is_no_pose() -> None:

@@ -75,7 +75,7 @@ angle."""
 MAX_STATUS = 70
 """Letters of a status that tables and titles show; the tables of the poses have all of it."""
 NetworkMatches = Callable[[str], PairMatches]
-"""Returns the stored network matches between a query image and the map image of a given name."""
+"""Returns the known network matches between a query image and the map image of a given name; else raises KeyError."""
 
 # Of the poses of a rig
 RANSAC_CONFIDENCE = 0.999

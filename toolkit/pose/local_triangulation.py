@@ -24,7 +24,7 @@ from toolkit.manifest import MapSettings, PnpSettings
 from toolkit.mapping.build import MAX_EPIPOLAR_ERROR_PX, instants, match_pairs, select_pairs
 from toolkit.mapping.local_map import LocalMap
 from toolkit.mapping.triangulation import triangulate
-from toolkit.pose.base import Localizer, Prior, Query, QueryResult, References
+from toolkit.pose.base import Localizer, NetworkMatches, Prior, Query, QueryResult, References
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer, PnpMatches
 from toolkit.threads import fixed_sums
@@ -143,11 +143,13 @@ class OnDemandLocalizer(Localizer):
         for camera, (query_features, retrieved) in enumerate(zip(query.features, references, strict=True)):
             if isinstance(query_features, str):
                 continue  # no matches of an unreadable image are stored
-            stored = query.network_matches[camera][number] if query.network_matches else None
+            known: NetworkMatches = dict[str, PairMatches]().__getitem__
+            if query.network_matches:
+                known = query.network_matches[camera][number] or known
             for name in (self.posed.names[index] for index in retrieved.images):
-                if stored is not None:  # matches with an unreadable reference are not stored
-                    matches[camera][name] = stored(name) if len(features[name]) else PairMatches.none()
-                else:
+                try:
+                    matches[camera][name] = known(name)
+                except KeyError:  # a reference that could not be read, or was not asked before
                     to_match[camera, name] = query_features[number], features[name]
         with self._network:
             new_matches = method.matcher.match(list(to_match.values()))

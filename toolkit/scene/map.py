@@ -355,10 +355,12 @@ class Map:
             return result
         query, first = self._with_fallback_features(query), result
         for asked in self.rounds(references, first):
-            result = self.retry(query, asked, result, priors)
+            matches = self.match(query, asked, self.fallback)
+            query = replace(query, network_matches=matches.query.network_matches)  # the next round has them again
+            result = self.retry(query, matches, result, priors)
             if self.is_settled(first, result):
                 break
-        return result
+        return replace(result, seconds=time.perf_counter() - started)
 
     def predict(self, queries: Sequence[QueryInput]) -> list[Any]:
         """Return a network's prediction for each query, for `locate`; see `Localizer.predict`."""
@@ -397,21 +399,18 @@ class Map:
 
     @fixed_sums
     def retry(
-        self, query: Query, references: Sequence[References], first: QueryResult, priors: Sequence[Prior] = ()
+        self, query: Query, matches: QueryMatches, first: QueryResult, priors: Sequence[Prior] = ()
     ) -> QueryResult:
-        """Retry an unsure query with the fallback features, which it has; return the better of both results.
+        """Retry an unsure query with its matches of `fallback`; return the better of both results.
 
         `first` is the latest result. `found_by` names the fallback features if the pose was computed with them.
         """
-        assert self.fallback is not None
-        started = time.perf_counter()
         poses = [first.world_from_rig, *(rival.world_from_rig for rival in first.rivals)]
         known = [_canonical(pose) for pose in poses[:MAX_KNOWN] if pose is not None]
         # The earlier poses are judged by all kinds of features.
         known_priors = [
             Prior(pose, images, SEARCH_DEG[0], "first") for pose in known if len(images := self._images_near(pose))
         ]
-        matches = self.match(query, references, self.fallback)
         result = self.solve(query, matches, None, [*priors, *known_priors], self.fallback)
         result = replace(result, found_by="+".join([result.found_by, *(kind.name for kind in self.escalation)]))
         if first.status is Status.OK:
@@ -420,7 +419,6 @@ class Map:
         earlier = first.first_seconds
         return replace(
             result if better else first,
-            seconds=first.seconds + time.perf_counter() - started,
             first_status=first.first_status or first.status_text,
             first_seconds=round(first.seconds, 4) if earlier is None else earlier,
             context=first.context,  # it has all references
