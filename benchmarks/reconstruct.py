@@ -9,8 +9,9 @@ links to its files, in a folder per camera. `known` is the toolkit with the capt
 own map. COLMAP has its defaults (SIFT, all pairs, the incremental mapper, a camera
 per folder) without GPU. Without input, one rendered room is measured. Errors are those of all registered photographs
 after a similarity to the true poses: rotation from all orientations, then scale and shift from the positions.
-`--queries` localizes the capture's queries of the same device and place, with their given intrinsics, in each map of
-the toolkit after this similarity, with default settings.
+`--queries` localizes the capture's queries of the same device and place in each map of the toolkit after this
+similarity, with default settings: with their given intrinsics and rigs where the map has the given ones, else each
+image alone, with the intrinsics that were estimated for the map's camera.
 """
 
 import argparse
@@ -29,6 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from common import add_out, check_out, in_own_process, limit_cores, markdown_table, write_out
 
+from toolkit.capture import Session
 from toolkit.geometry import Floats
 
 
@@ -58,15 +60,20 @@ def sets_of_capture(path: Path, folder: Path) -> Sets:
             target = folder / name.replace(" ", "_")
             made = Photographs(target, {}, session.path, part, target.with_suffix(".txt"))
             made = sets.setdefault(name, made)
-            camera = sensor.rpartition("/")[2] if session.rigs is not None else ""
-            own = str(Path(camera) / session.image_path(row).name)
-            (target / own).parent.mkdir(parents=True, exist_ok=True)
-            (target / own).symlink_to(session.image_path(row).resolve())
-            made.truth[own] = poses[row]
+            made.truth[own := linked(session, row, target)] = poses[row]
             assert made.table is not None
             with made.table.open("a") as stream:
                 stream.write(f"{own} {camera_text(session.camera(sensor)).replace(',', '')}\n")
     return sets
+
+
+def linked(session: Session, row: int, folder: Path) -> str:
+    """Link an image of a session into a folder of its camera, if it is of a rig; return its name there."""
+    sensor = session.images["sensor_id"].iloc[row]
+    name = str(Path(sensor.rpartition("/")[2] if session.rigs is not None else "") / session.image_path(row).name)
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    (folder / name).symlink_to(session.image_path(row).resolve())
+    return name
 
 
 def set_of_table(images: Path, table: Path) -> Sets:
@@ -159,20 +166,27 @@ def part_of_session(session: Path, target: Path, part: str) -> None:
     shutil.copytree(session / "raw_data" / part, target / "raw_data" / part)
 
 
-def ask_queries(photographs: Photographs, place: Path, poses: dict[str, Floats]) -> tuple[list[float], list[float]]:
+def ask_queries(
+    photographs: Photographs, place: Path, poses: dict[str, Floats], own_cameras: bool
+) -> tuple[list[float], list[float]]:
     """Localize the queries of the same place in a map, moved to the truth; return errors in degrees and meters."""
+    import pandas as pd
+
     from toolkit import embed, localize, retrieve
-    from toolkit.capture import Capture, Session, Trajectory
+    from toolkit.capture import Capture, Trajectory
+    from toolkit.capture.tables import POSE_NAMES
     from toolkit.evaluate import evaluate_scene
+    from toolkit.exchange.interchange import import_images
     from toolkit.files import SceneFiles
-    from toolkit.geometry import make_pose
+    from toolkit.geometry import make_pose, qt_from_pose
 
     assert photographs.session is not None
     device = photographs.session.name.removesuffix("_map")
     given = Capture.open(photographs.session.parents[1])
     number = given[f"{device}_map"].subsessions.index(photographs.part)
     queries, root = given[f"{device}_query"], place / "sessions"
-    part_of_session(queries.path, root / f"{device}_query", queries.subsessions[number])
+    if own_cameras:
+        part_of_session(queries.path, root / f"{device}_query", queries.subsessions[number])
     session = Session.open(root / f"{device}_map")
     if session.rigs is None and poses is not photographs.truth:
         rotation, scale, shift = similarity(poses, photographs.truth)
@@ -183,6 +197,12 @@ def ask_queries(photographs: Photographs, place: Path, poses: dict[str, Floats])
         Trajectory.from_poses(times, sensors, ours).write(session.path / "trajectories.txt")
         record = json.loads((session.path / "proc/import.json").read_text())
         (session.path / "proc/import.json").write_text(json.dumps(record | {"unit": "m"}))
+    if not own_cameras:
+        rows = np.flatnonzero(queries.subsession_of() == queries.subsessions[number])
+        names = [linked(queries, row, place.parent / "queries") for row in rows.tolist()]
+        table = pd.DataFrame(qt_from_pose(queries.world_from_cam(rows, ground_truth=True)), columns=list(POSE_NAMES))
+        table.assign(image=names).to_csv(place.parent / "queries.csv", index=False)
+        import_images(place.parent / "queries", place, device, table=place.parent / "queries.csv")
     files = SceneFiles(place / "run", place.name)
     embed.embed_sessions(root, files.embeddings, features_dir=files.features)
     retrieve.retrieve_pairs(root, files.embeddings, out_jsonl=files.retrieval_dir, queries="all")
@@ -239,7 +259,7 @@ def measure(
         place = Path(folder) / "PLACE"
         asked: tuple[list[float], list[float]] = ([], [])
         if ask and place.is_dir() and photographs.session is not None:
-            asked = ask_queries(photographs, place, poses)
+            asked = ask_queries(photographs, place, poses, method in ("known", "given"))
         # hloc runs in a child process
         cpu_s = sum(end[:4]) - sum(cpu[:4])
         return wall_s, cpu_s, poses, asked

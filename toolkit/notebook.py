@@ -430,7 +430,7 @@ def choose_photograph(scene_map: Any) -> None:
             file = Path(folder) / Path(chosen["name"]).name
             file.write_bytes(chosen["content"])
             try:
-                camera = with_focal(guessed_camera(file, []).camera, focal.value) if focal.value > 0 else None
+                camera = with_focal(guessed_camera(file).camera, focal.value) if focal.value > 0 else None
                 result = localize_image(scene_map, file, camera)
                 display(result, result.show(), result.show_3d())
             except errors.ToolkitError as error:

@@ -577,6 +577,33 @@ def test_images_without_a_focal_length_are_left_out(folder: Path, tmp_path: Path
     assert read_number({1: "many", 2: float("inf")}, 1) == read_number({2: float("inf")}, 2) == 0
 
 
+def test_queries_without_intrinsics_are_of_the_camera_of_the_map_that_took_them(tmp_path: Path) -> None:
+    """After `reconstruct`, the map's cameras are known better than EXIF tells them; folders tell cameras apart."""
+    phone = {0xA405: 26, 0x920A: 4.2}
+    focals = {"map/left/1.jpg": 50.0, "map/left/2.jpg": 50.0, "map/right/1.jpg": 60.0, "map/phone/1.jpg": 55.0}
+    for name in focals:
+        save(tmp_path / name, tags=phone if "phone" in name else None)
+    rows = [f"{name[4:]},1,0,0,0,{number},0,0,PINHOLE,64,48,{focal} {focal} 31 25"
+            for number, (name, focal) in enumerate(focals.items())]  # fmt: skip
+    table = tmp_path / "map.csv"
+    table.write_text("\n".join(["image,qw,qx,qy,qz,tx,ty,tz,model,width,height,params", *rows]) + "\n")
+    import_images(tmp_path / "map", tmp_path / "PLACE", split="map", table=table)
+    asked = {"left/9.jpg": None, "right/9.jpg": None, "other/9.jpg": None, "phone/9.jpg": phone, "else/9.jpg": phone,
+             "zoomed/9.jpg": {0xA405: 52, 0x920A: 4.2}}  # fmt: skip
+    for name, tags in asked.items():
+        save(tmp_path / "queries" / name, tags=tags)
+    save(tmp_path / "queries" / "small/9.jpg", (32, 24))
+    images = import_images(tmp_path / "queries", tmp_path / "PLACE").images.set_index("image")
+    session = Capture.open(tmp_path / "PLACE")["ios_query"]
+    names = [path.split("/images/")[1] for path in session.images["path"]]
+    found = {name: camera.params.tolist() for name, camera in zip(names, session.cameras(), strict=True)}
+    assert {name: params[0] for name, params in found.items()} == pytest.approx(
+        {"left/9.jpg": 50, "right/9.jpg": 60, "phone/9.jpg": 55, "else/9.jpg": 55, "zoomed/9.jpg": 96.15}, abs=0.01
+    )
+    assert found["left/9.jpg"] == [50, 50, 31, 25]
+    assert images["status"][["other/9.jpg", "small/9.jpg"]].str.startswith("no focal length in EXIF").all()
+
+
 def test_an_image_of_absurd_size_is_a_row(folder: Path, tmp_path: Path) -> None:
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

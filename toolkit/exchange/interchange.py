@@ -42,12 +42,11 @@ import pycolmap
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from toolkit.capture import parse_camera
+from toolkit.capture import Session, parse_camera
 from toolkit.capture.images import (
     camera_text,
     decode,
     default_workers,
-    exif_camera,
     find_mask,
     heic_is_read,
     is_file,
@@ -88,6 +87,7 @@ from toolkit.exchange.recordings import (
 from toolkit.files import file_fingerprint, files_fingerprint, read_json
 from toolkit.geometry import Floats, invert, make_pose, pose_from_qt, qt_from_pose
 from toolkit.manifest import nearest, require_known
+from toolkit.scene.query import MapCameras, known_camera
 
 POSE_DIRECTIONS = ("world_from_cam", "cam_from_world", "rotation_of_cam_from_world")
 _CAMERA_COLUMNS = ("model", "width", "height", "params")
@@ -165,8 +165,8 @@ def import_images(
 ) -> ImportReport:  # fmt: skip
     """Make a session from a folder of images without rigs.
 
-    Intrinsics come from the table, else from `cameras`, else from `camera`, else they are guessed from each image's
-    EXIF.
+    Intrinsics come from the table, else from `cameras`, else from `camera`; else they are, for queries, those of the
+    map's camera that took the image, see `scene.query.known_camera`, or guessed from its EXIF.
 
     Args:
         images: folder; without a table, all JPEG and PNG files in and below it are imported.
@@ -209,6 +209,9 @@ def import_images(
         texts = [one if isinstance(one, str) else camera_text(one) for one in listed_cameras.values()]
         listed_cameras = dict(zip(texts, listed_cameras.values(), strict=True))
     shared_camera = None if camera is None else camera_at("camera", camera)
+    map_session = draft.session.with_name(f"{device}_map")
+    unknown = camera is None and not listed_cameras and not {"model", "camera_id"} & {*rows}
+    of_map = MapCameras(Session.open(map_session)) if unknown and split == "query" and map_session.is_dir() else None
     posed = rows if truth is None else _read_truth(Path(truth), rows, draft, tracks[1])
     poses = _poses_of(posed, poses_are)
     bad = posed[posed["problem"] != ""] if "problem" in posed else posed[:0]
@@ -224,7 +227,7 @@ def import_images(
         try:
             if truth is None and name in bad_poses:
                 raise CaptureError(f"{table}, {bad_poses[name]}")
-            image_camera, origin = _camera_of(row, listed_cameras, shared_camera, folder / name, where)
+            image_camera, origin = _camera_of(row, listed_cameras, shared_camera, folder / name, where, of_map)
         except (ImageError, CaptureError) as error:
             image_camera, origin = str(error), ""
         draft.add_image(name, image_camera, poses.get(name), origin, times.get(name))
@@ -354,9 +357,10 @@ def camera_at(where: object, params: str) -> pycolmap.Camera:
 
 def _camera_of(
     row: Mapping[Any, Any], by_id: Mapping[str, pycolmap.Camera | str], shared: pycolmap.Camera | None, path: Path,
-    where: str,
+    where: str, of_map: MapCameras | None = None,
 ) -> tuple[pycolmap.Camera | str, str]:  # fmt: skip
-    """Return the camera of an image and its origin: the table, cameras.txt, the camera shared by all images, or EXIF.
+    """Return the camera of an image and its origin: the table, cameras.txt, the camera shared by all images, or that of
+    `known_camera`.
 
     The camera may be why it cannot be used. `where` names file and line of the image's row, for messages.
     """
@@ -373,7 +377,7 @@ def _camera_of(
         raise CaptureError(f"cameras.txt has {len(by_id)} different cameras; give {do}.")
     if by_id:
         return next(iter(by_id.values())), "given by cameras.txt"
-    return (shared, "given by --camera") if shared is not None else exif_camera(path)[:2]
+    return (shared, "given by --camera") if shared is not None else known_camera(path, of_map)[:2]
 
 
 # Tables

@@ -14,9 +14,8 @@ from toolkit.capture.images import sees_all
 from toolkit.errors import ArtifactError, CameraError, ImageError, reason_of
 from toolkit.pose.base import CAMERA, Query, QueryResult, RoughPose, Status
 from toolkit.scene.map import Map
-from toolkit.scene.query import Image, camera_key, guessed_camera, with_focal
+from toolkit.scene.query import Image, MapCameras, camera_key, guessed_camera, with_focal
 
-MAP_CAMERAS = 1000  # cameras of the map among which that of an image of equal size is looked for, at most
 FOCAL_STEPS, FOCAL_DOUBT = 3, 1.3
 """Steps of the estimate of an unknown focal length; the matches must contradict one that is larger or smaller by a
 factor."""
@@ -105,10 +104,7 @@ class _UnknownFocal:
         self, scene_map: Map, image: Image, turns: Sequence[int] | None = None, near: RoughPose | None = None
     ) -> None:
         self.scene_map, self.image, self.turns, self.near = scene_map, image, turns, near
-        sensors = scene_map.session.sensors
-        ids = sensors.loc[sensors["sensor_type"] == "camera", "sensor_id"].head(MAP_CAMERAS)
-        known = [scene_map.session.camera(str(name)) for name in ids]
-        self.camera, self.origin, self.cropped = guessed_camera(image, known)
+        self.camera, self.origin, self.cropped = guessed_camera(image, MapCameras(scene_map.session))
         self.described: Query | None = None  # with features, while different intrinsics are tried
 
     def locate(self, focal_px: float, right: float = 0.0, down: float = 0.0) -> QueryResult:

@@ -7,6 +7,7 @@ import operator
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from toolkit import geometry
+from toolkit.capture import Session
 from toolkit.capture.images import (
     GuessedCamera,
     camera_text,
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
 
 _MAX_DEVIATION = 1e-3
 """Largest deviation of R @ R.T from the identity for a rotation R; rounding to float32 or in files stays below."""
+MAX_MAP_CAMERAS = 1000  # cameras of the map among which that of an image is looked for, at most
 FOCAL_PRIOR = 1.2  # focal length of a camera that nothing is known of, in multiples of the longer side
 Image = Any
 """A file (str, Path), or pixels as `pixels_from` takes them."""
@@ -132,23 +135,98 @@ def pixels_from(image: Any) -> NDArray[np.uint8]:
     return np.round(pixels * scale).astype(np.uint8)
 
 
-def guessed_camera(image: Image, known: Sequence[pycolmap.Camera]) -> GuessedCamera:
-    """Return a camera of an image whose focal length is from EXIF, the only known one of its size, or a guess.
+class MapCameras:
+    """The cameras of a map, among which that of another image is looked for."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        sensors = session.sensors
+        ids = sensors.loc[sensors["sensor_type"] == "camera", "sensor_id"].head(MAX_MAP_CAMERAS)
+        self._cameras = {str(name): session.camera(str(name)) for name in ids}
+        self._alike = dict[tuple[int, int], dict[str, str]]()
+
+    def of_size(self, size: tuple[int, int]) -> dict[str, str]:
+        """Return the sensors of images of this width and height; for each its intrinsics, as text."""
+        if size not in self._alike:
+            fitting = {name: one for name, one in self._cameras.items() if (one.width, one.height) == size}
+            self._alike[size] = {name: camera_text(one) for name, one in fitting.items()}
+        return self._alike[size]
+
+    @cached_property
+    def _images(self) -> dict[str, Path]:
+        """An image of each sensor."""
+        first = self._session.images.drop_duplicates("sensor_id")["sensor_id"]
+        return {name: self._session.image_path(row) for row, name in first.items()}
+
+    def with_exif(self, sensors: Mapping[str, str], key: tuple[str, ...]) -> dict[str, str]:
+        """Return those of which an image has this camera and focal length in EXIF, see `exif_key`."""
+        images = self._images
+        return {name: text for name, text in sensors.items() if name in images and _exif_key_of(images[name]) == key}
+
+    def only_one(self, sensors: Mapping[str, str], folder: str) -> GuessedCamera | None:
+        """Return the intrinsics that all sensors have, or all with images in a folder of this name; None if they
+        differ.
+        """
+        if len({*sensors.values()}) > 1:
+            sensors = {name: text for name, text in sensors.items() if self._folder(name) == folder}
+        if len({*sensors.values()}) != 1:
+            return None
+        return GuessedCamera(self._cameras[next(iter(sensors))], "that of the map's camera")
+
+    def _folder(self, sensor: str) -> str:
+        return self._images[sensor].parent.name if sensor in self._images else ""
+
+
+@lru_cache(MAX_MAP_CAMERAS)
+def _exif_key_of(path: Path) -> tuple[str, ...]:
+    try:
+        return exif_key(read_header(path)[1])
+    except ImageError:
+        return ()
+
+
+def known_camera(image: Image, cameras: MapCameras | None = None) -> GuessedCamera:
+    """Return the camera of an image without intrinsics: that of the map's camera that took it, or one from EXIF.
+
+    A camera of the map is known better than EXIF knows one. It took the image if one of its images has the same size,
+    make, model and focal length in EXIF; of several such, that of a folder of the same name. For an image without a
+    focal length, an equal size is enough.
+
+    Args:
+        image: file or pixels.
+        cameras: of the map; None: there is no map.
+
+    Raises:
+        ImageError: the image cannot be read, or its camera is not known.
+    """
+    if isinstance(image, str | Path):
+        (size, exif), folder = read_header(Path(image)), Path(image).parent.name
+    else:
+        height, width = pixels_from(image).shape[:2]
+        size, exif, folder = (width, height), dict[int, Any](), ""
+    alike, key = ({} if cameras is None else cameras.of_size(size)), exif_key(exif)
+    if cameras and alike and any(key) and (found := cameras.only_one(cameras.with_exif(alike, key), folder)):
+        return found
+    try:
+        if isinstance(image, str | Path):
+            return exif_camera(Path(image))
+        raise ImageError("pixels have no EXIF: give the intrinsics")
+    except ImageError:
+        if cameras and (found := cameras.only_one(alike, folder)):
+            return found
+        raise
+
+
+def guessed_camera(image: Image, cameras: MapCameras | None = None) -> GuessedCamera:
+    """Return `known_camera`, or a guess if it is not known.
 
     Raises:
         ImageError: the image cannot be read.
     """
-    is_file = isinstance(image, str | Path)
-    if is_file:
-        try:
-            return exif_camera(Path(image))
-        except ImageError:  # no focal length, or no image, which the next line says
-            width, height = stored_size(image)
-    else:
-        height, width = pixels_from(image).shape[:2]
-    alike = {camera_text(camera): camera for camera in known if (camera.width, camera.height) == (width, height)}
-    if len(alike) == 1:
-        return GuessedCamera(next(iter(alike.values())), "that of the map's camera")
+    try:
+        return known_camera(image, cameras)
+    except ImageError:  # no focal length, or no image, which the next line says
+        width, height = stored_size(image) if isinstance(image, str | Path) else pixels_from(image).shape[1::-1]
     params = [FOCAL_PRIOR * max(width, height), width / 2, height / 2]
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
     return GuessedCamera(camera, f"a guess, {FOCAL_PRIOR:g} times the longer side")
