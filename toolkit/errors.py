@@ -71,7 +71,7 @@ class ArtifactError(ToolkitError):
 
 
 class DamagedError(ArtifactError):
-    """Items of a file differ from what was written; see `store.items.heals`."""
+    """Items of a file differ from what was written; see `store.items.retry_damaged`."""
 
     def __init__(self, path: Path, message: str) -> None:
         super().__init__(message)

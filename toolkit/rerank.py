@@ -37,13 +37,13 @@ from toolkit.files import (
 from toolkit.geometry import Ints
 from toolkit.manifest import RerankSettings
 from toolkit.runs.pairs import PairRows
-from toolkit.store.items import Items, heals, items_beside, remove_items
+from toolkit.store.items import Items, items_beside, remove_items, retry_damaged
 from toolkit.threads import one_thread
 
 log = logging.getLogger(__name__)
 
 
-@heals
+@retry_damaged
 def rerank_pairs(
     sessions_root: str | Path,
     retrieval_dir: str | Path,

@@ -56,7 +56,7 @@ from toolkit.files import (
 from toolkit.geometry import Floats, Ints, unit
 from toolkit.manifest import LocalizeSettings, SiftSettings
 from toolkit.scene.query import FOCAL_PRIOR
-from toolkit.store.items import Items, heals
+from toolkit.store.items import Items, retry_damaged
 from toolkit.threads import one_thread
 
 log = logging.getLogger(__name__)
@@ -427,7 +427,7 @@ def _quiet() -> Iterator[None]:
         pycolmap.logging.minloglevel = level
 
 
-@heals
+@retry_damaged
 def reconstruct(
     sources: Sequence[str | Path], capture: str | Path, device: str = "ios", fps: float | None = None,
     camera: str | None = None, distance: tuple[str, str, float] | None = None, mapper: str = "incremental",
@@ -666,7 +666,7 @@ def _hand_over(work: _Work, session: Path) -> None:
 # A map that grows
 
 
-@heals
+@retry_damaged
 def add_recording(
     sources: Sequence[str | Path], capture: str | Path, device: str = "ios", fps: float | None = None
 ) -> ImportReport:

@@ -172,7 +172,7 @@ def extract_session(
         todo = items.left((name, source, row_of[name], int(turns[row_of[name]])) for name, source in made_from.items())
         if todo and any(path.parent.glob(f"{path.name.partition('-')[0]}-*.h5")):
             log.warning("%s: features in .h5 files, of an older version of the toolkit, are not used.", path.parent)
-        todo = items.spread(_extract_into, todo, (session, extractor), label, "image")
+        todo = items.distribute(_extract_into, todo, (session, extractor), label, "image")
         _extract_into(items, todo, session, extractor, workers, label if progress and todo else "")
     return FeatureStore._of(path, items, made_from)
 
@@ -343,7 +343,7 @@ def match_sessions(
         sources = (stores[0].made_from[first] + stores[1].made_from[second] for first, second in readable)
         todo = items.left((match_name(*names), source, *names) for names, source in zip(readable, sources, strict=True))
         label = f"{matcher.settings['name']} {' '.join(sessions)}"
-        todo = items.spread(_match_into, todo, (stores, matcher, label), label, "pair", matcher.batch_size)
+        todo = items.distribute(_match_into, todo, (stores, matcher, label), label, "pair", matcher.batch_size)
         _match_into(items, todo, stores, matcher, label)
     return MatchStore(path, items)
 

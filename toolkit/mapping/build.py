@@ -340,7 +340,7 @@ class MapPlan(Remade):
         with Items(self._matches_path(number), self._matches_made_by(number), again=not skip_existing) as items:
             todo = items.left((match_name(names[i], names[j]), made_from[i] + made_from[j], i, j) for i, j in pairs)
             label = f"match {self.session.id}" + (f" {number + 1}/{len(self.tiles)}" if len(self.tiles) > 1 else "")
-            todo = items.spread(_match_share, todo, (self.of_worker,), label, "pair")
+            todo = items.distribute(_match_share, todo, (self.of_worker,), label, "pair")
             self.match_into(items, todo, workers, label if todo else "")
 
     def match_into(self, items: Items, todo: Sequence[_ToMatch], workers: int, label: str) -> None:

@@ -160,7 +160,7 @@ class Items(Mapping[str, dict[str, NDArray[Any]]]):
         """Return the items that are not there yet, or were made from other sources."""
         return [item for item in items if not self.is_current(item[0], item[1])]
 
-    def spread(
+    def distribute(
         self, function: Callable[..., object], items: Sequence[Item], arguments: tuple[Any, ...], label: str, unit: str,
         multiple: int = 1,
     ) -> list[Item]:  # fmt: skip
@@ -260,7 +260,7 @@ def remove_items(path: Path) -> None:
     shutil.rmtree(items_beside(path), ignore_errors=True)
 
 
-def heals(stage: Callable[P, Result]) -> Callable[P, Result]:
+def retry_damaged(stage: Callable[P, Result]) -> Callable[P, Result]:
     """Decorate a stage: if it finds damaged items, drop them and call it again, which makes them; once a folder."""
 
     @wraps(stage)
@@ -280,7 +280,7 @@ def heals(stage: Callable[P, Result]) -> Callable[P, Result]:
 
 def _do_share(folder: Path, made_by: Any, since: int, items: Sequence[Item], function: Callable[..., object],
               arguments: tuple[Any, ...]) -> None:  # fmt: skip
-    """Do a share of `Items.spread` on a worker."""
+    """Do a share of `Items.distribute` on a worker."""
     with Items(folder, made_by, since=since) as opened:
         function(opened, opened.left(items), *arguments)
 
