@@ -174,7 +174,7 @@ def test_a_wrong_focal_length_of_the_map_is_named(
         ]
         rays = [rays_of(cameras[index], xy) for index, xy in zip((pair.i, pair.j), pixels, strict=True)]
         pairs.append(pair._replace(rays_i=rays[0], rays_j=rays[1]))
-    text = SurveyedPairs(pairs, survey.images.world_from_cams).misfit(cameras)
+    text = SurveyedPairs(pairs, survey.images.world_from_cams).check_intrinsics(cameras)
     assert text.startswith("the focal length")
     if "times" in text:
         found = 1 / float(text.split(" are ")[1].split()[0])
@@ -192,7 +192,7 @@ def test_what_errors_of_slam_imitate_is_not_blamed_on_the_camera(small_capture: 
             pair._replace(rays_i=_changed(pair.rays_i, change), rays_j=_changed(pair.rays_j, change))
             for pair in survey.sample
         ]
-        assert not SurveyedPairs(pairs, survey.images.world_from_cams).misfit(survey.images.cameras)
+        assert not SurveyedPairs(pairs, survey.images.world_from_cams).check_intrinsics(survey.images.cameras)
 
 
 def test_a_focal_length_one_percent_off_is_not_worth_a_word(small_capture: Path, small_features: Path) -> None:
@@ -202,7 +202,7 @@ def test_a_focal_length_one_percent_off_is_not_worth_a_word(small_capture: Path,
         pair._replace(rays_i=_changed(pair.rays_i, change), rays_j=_changed(pair.rays_j, change))
         for pair in survey.sample
     ]
-    assert not SurveyedPairs(pairs, survey.images.world_from_cams).misfit(survey.images.cameras)
+    assert not SurveyedPairs(pairs, survey.images.world_from_cams).check_intrinsics(survey.images.cameras)
 
 
 def rotations_of_cam_from_world(poses: Floats) -> Floats:

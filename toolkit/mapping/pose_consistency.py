@@ -163,7 +163,7 @@ class Survey:
             result,
             verdict="consistent",
             wrong=self._wrong_images(local_map),
-            camera=pairs.misfit(self.images.cameras),
+            camera=pairs.check_intrinsics(self.images.cameras),
             rotation_noise_deg=round(noise.rotation_deg, 4),
             position_noise=round(noise.position, 6),
             direction_noise_deg=round(noise.direction_deg(self.typical_depth() / local_map.length), 4),

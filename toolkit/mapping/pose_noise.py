@@ -184,7 +184,7 @@ class SurveyedPairs:
             parts.append((share * weighted.T @ jacobian, share * weighted.T @ errors))
         return parts
 
-    def misfit(self, cameras: Sequence[pycolmap.Camera]) -> str:
+    def check_intrinsics(self, cameras: Sequence[pycolmap.Camera]) -> str:
         """Say which one change of all intrinsics the matches ask for; empty if for none.
 
         Args:

@@ -234,8 +234,8 @@ class QueryResult:
     remark: str = ""
     """Intrinsics that fit the query better than the stated ones; images that cannot be read; for a prediction, what was
     left out or is unknown. Column `reason` of the table."""
-    misfit: bool = False
-    """Whether the matches contradict the intrinsics of the query, see `map_matching.find_misfit`. No other features
+    camera_contradicted: bool = False
+    """Whether the matches contradict the query's intrinsics, see `map_matching.check_intrinsics`. No other features
     repair that. A small contradiction only widens the covariance."""
     focals_px: tuple[float, ...] = ()
     """Per query image, the focal length that fits, or NaN if the focal length is not the problem. Empty if the
@@ -382,7 +382,7 @@ class QueryResult:
         arrays |= {"found_by": codes.astype(np.uint8), "found_by_labels": labels.astype(object)}
         arrays["world_from_rig"] = np.full((4, 4), np.nan) if self.world_from_rig is None else self.world_from_rig
         arrays["covariance"] = np.full((6, 6), np.nan) if self.covariance is None else self.covariance
-        arrays["misfit"] = np.array(self.misfit)
+        arrays["misfit"] = np.array(self.camera_contradicted)
         arrays["rivals"] = np.array([rival.world_from_rig for rival in self.rivals]).reshape(-1, 4, 4)
         arrays["rival_supports"] = np.array([rival.support for rival in self.rivals], np.float64)
         return arrays | {name: np.array(getattr(self, name), object) for name in _NAMES}
@@ -413,7 +413,7 @@ class QueryResult:
             rejected=rejected,
             correspondences=Correspondences(**read, found_by=found_by),
             rivals=tuple(map(Rival, arrays["rivals"].reshape(-1, 4, 4), arrays["rival_supports"].tolist())),
-            misfit=bool(arrays["misfit"]),
+            camera_contradicted=bool(arrays["misfit"]),
         )
 
 

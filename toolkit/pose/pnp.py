@@ -42,7 +42,7 @@ from toolkit.pose.base import (
     agree,
     stds_of,
 )
-from toolkit.pose.map_matching import MapMatcher, MappedFeatures, MatchCache, Vicinity, find_misfit
+from toolkit.pose.map_matching import MapMatcher, MappedFeatures, MatchCache, Vicinity, check_intrinsics
 from toolkit.threads import fixed_sums
 
 # Of the probability that a pose is correct
@@ -314,7 +314,7 @@ class PnpLocalizer(Localizer):
             result = self._failed(reason, all_matches)
         for prior in priors:
             result = self._compare(rig, all_matches, hypotheses, result, references, prior)
-        result = self._with_misfit(rig, all_matches, result)
+        result = self._with_checked_intrinsics(rig, all_matches, result)
         partly = len(matches.usable) < len(matches.query.features)
         result = _of_all_images(matches, result, missing) if partly else result
         if self.lift is None or result.world_from_rig is not None:
@@ -322,14 +322,14 @@ class PnpLocalizer(Localizer):
         lifted = self.lift(matches.query, matches.references, None, priors)
         return result if lifted is None or lifted.world_from_rig is None else lifted
 
-    def _with_misfit(self, query: RigQuery, matches: Matches, estimate: QueryResult) -> QueryResult:
+    def _with_checked_intrinsics(self, query: RigQuery, matches: Matches, estimate: QueryResult) -> QueryResult:
         """Return the estimate, with a warning if matches made without the pose contradict the query's intrinsics.
 
         The pose remains that of the stated intrinsics. Its covariance grows to cover the pose of those that would fit.
         """
         if estimate.world_from_rig is None:
             return estimate
-        misfit = find_misfit(
+        check = check_intrinsics(
             query,
             geometry.invert(estimate.world_from_rig),
             matches[self.map.track_lengths(matches.point) > 1],  # points with one observation are not triangulated
@@ -338,20 +338,20 @@ class PnpLocalizer(Localizer):
             focal_alone=estimate.rival_support > MAX_RIVAL_SUPPORT,
             noise_deg=self._noise_deg,
         )
-        if misfit is None:
+        if check is None:
             return estimate
         covariance = estimate.covariance
-        wider = None if covariance is None else covariance + np.outer(misfit.shift, misfit.shift)
-        estimate = replace(estimate, covariance=wider, misfit=True)
-        if not misfit.doubtful:
+        wider = None if covariance is None else covariance + np.outer(check.shift, check.shift)
+        estimate = replace(estimate, covariance=wider, camera_contradicted=True)
+        if not check.doubtful:
             return estimate
         return replace(
             estimate,
             status=Status.LOW_CONFIDENCE,
             reason=CAMERA,
-            focals_px=misfit.focals_px(query.cameras),
-            centers_px=misfit.centers_px(query.cameras),
-            remark=misfit.reason(query.cameras),
+            focals_px=check.focals_px(query.cameras),
+            centers_px=check.centers_px(query.cameras),
+            remark=check.reason(query.cameras),
         )
 
     def _compare(

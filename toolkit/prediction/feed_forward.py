@@ -366,15 +366,15 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...], image_names: Seque
         R, covariance = rig_from_cam[:3, :3], np.diag(np.full(6, np.inf))
         covariance[:3, :3] = R @ covariances[best][:3, :3] @ R.T
     focals = tuple(answer.focal_px for answer in cameras)
-    misfit = bool(np.isfinite(focals).any())
-    if misfit:
+    contradicted = bool(np.isfinite(focals).any())
+    if contradicted:
         seen = ", ".join(f"{focal:.0f}" for focal in focals if np.isfinite(focal))
         reasons = "; ".join(filter(None, (reasons, f"the network sees a focal length of {seen} px")))
     consistent = [int(i) for index in kept for i in cameras[index].references[alignments[index].consistent]]
     shown = [int(i) for answer in cameras if answer.prediction is not None for i in answer.references]
     return QueryResult(
-        Status.OK if sure and not misfit else Status.LOW_CONFIDENCE,
-        CAMERA if misfit else "",
+        Status.OK if sure and not contradicted else Status.LOW_CONFIDENCE,
+        CAMERA if contradicted else "",
         world_from_rig=pose,
         covariance=covariance,
         references=tuple(image_names[index] for index in dict.fromkeys(consistent)),
@@ -382,8 +382,8 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...], image_names: Seque
         scale_std=min(alignments[index].scale_std for index in kept),
         rejected=tuple(image_names[index] for index in dict.fromkeys(shown) if index not in consistent),
         remark=reasons,
-        misfit=misfit,
-        focals_px=focals if misfit else (),
+        camera_contradicted=contradicted,
+        focals_px=focals if contradicted else (),
     )
 
 

@@ -376,7 +376,7 @@ class HybridLocalizer(Localizer):
         prior = self._prior(predicted)
         priors = (*priors, *(() if prior is None else (prior,)))
         estimate = self.pnp.solve(matches, None, priors)
-        if estimate.status is not Status.OK and not estimate.misfit:
+        if estimate.status is not Status.OK and not estimate.camera_contradicted:
             lifted = self.lifter.localize(query, references, answer, priors)
             estimate = estimate if lifted is None else _better(estimate, lifted)
         if predicted.world_from_rig is None:

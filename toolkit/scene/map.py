@@ -366,7 +366,7 @@ class Map:
 
     def is_unsure(self, result: QueryResult) -> bool:
         """Tell whether fallback features, if there are any, might find a better pose."""
-        if self.fallback is None or result.misfit or result.reason == NOISE:  # no features repair that
+        if self.fallback is None or result.camera_contradicted or result.reason == NOISE:  # no features repair that
             return False
         limit = MAX_SURE_STD_M * (1.0 if self.settings.unit else self.length)
         # A pose without matches has no deviation (NaN) and counts as precise.
@@ -468,8 +468,8 @@ class Map:
         result = replace(result, images=images, found_by=method or self.settings.method)
         if self.consistency.trusted or not posed:
             return result
-        # In such a map, a misfit says nothing about the query's camera, and what is called noise has another cause.
-        blamed = result.misfit or result.reason == NOISE
+        # There, a contradiction says nothing about the query's camera, and what is called noise has another cause.
+        blamed = result.camera_contradicted or result.reason == NOISE
         remark = "; ".join(filter(None, ["" if blamed else result.remark, self.consistency.text]))
         what = "poses" if self.consistency.verdict == "inconsistent" else "intrinsics"
         reason = f"the {what} of the map contradict its images"
