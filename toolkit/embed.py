@@ -177,7 +177,7 @@ class _Model:
                 todo = [(f"{at:08d}", source, at) for at in range(-(-len(part.rows) // settings.batch_size))]
                 store = store_of(part.session.id) if embedder.inputs == "features" else None
                 arguments = embedder, part, settings, store
-                with Items(items_beside(matrix_path), again=not self.skip_existing) as batches:
+                with Items(items_beside(matrix_path), skip_existing=self.skip_existing) as batches:
                     left = batches.distribute(_embed_into, batches.left(todo), arguments, _label(part), "batch")
                     _embed_into(batches, left, *arguments)
                     batches.flush()

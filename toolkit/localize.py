@@ -393,7 +393,7 @@ class _Pair:
         """
         names, source = [query_group(*key) for key in self.keys], fingerprint(record)
         numbers = {name: number for number, name in enumerate(names)}  # a keyframe list may repeat a query
-        with Items(self.file("items"), again=not self.stage.skip_existing) as items:
+        with Items(self.file("items"), skip_existing=self.stage.skip_existing) as items:
             items.drop_damaged()
             todo = items.left((name, source, number) for name, number in numbers.items())
             faulty = self._distribute(items, todo)

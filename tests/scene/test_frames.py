@@ -70,7 +70,7 @@ def test_all_frames_have_poses_and_what_failed_is_asked_again(answering: Any) ->
     assert errors_of(done, way).max() < 0.3
     assert list(done.single) == way.queries.frames.tolist()
     failed = [frame for frame, estimate in done.single.items() if estimate.status.startswith("failed")]
-    assert list(done.again) == failed
+    assert list(done.relocalized) == failed
     assert {image for image, near in asked if near is not None} == {1, 4, 6, 7, 10, 13, 16, 19}
     assert done.single[int(way.queries.frames[6])].status_text == "failed: torn"
 

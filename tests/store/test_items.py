@@ -81,7 +81,7 @@ def test_items_can_all_be_made_again(tmp_path: Path) -> None:
     todo = [("a", "key"), ("b", "key")]
     with Items(tmp_path) as items:
         add(items, "a", "b")
-    with Items(tmp_path, again=True) as items:
+    with Items(tmp_path, skip_existing=False) as items:
         assert items.left(todo) == todo
         add(items, "a")
         items.flush()
@@ -171,7 +171,7 @@ def test_a_reader_follows_items_to_a_later_shard(tmp_path: Path) -> None:
     with Items(tmp_path) as items:
         add(items, "a")
     reader = Items(tmp_path)
-    with Items(tmp_path, again=True) as items:
+    with Items(tmp_path, skip_existing=False) as items:
         add(items, "a", "b")
     assert len(shards(tmp_path)) == 1
     assert reader["a"]["values"][0] == ord("a")

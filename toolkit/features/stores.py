@@ -168,7 +168,7 @@ def extract_session(
     path, label = features_path(out, session.id, extractor.settings), f"{extractor.settings['name']} {session.id}"
     if not path.exists() and (made := session.path / "proc" / "features" / path.name).is_dir():
         link_folder(made, path)  # a reconstruction extracted them
-    with Items(path, extractor.settings, again=not skip_existing) as items:
+    with Items(path, extractor.settings, skip_existing=skip_existing) as items:
         todo = items.left((name, source, row_of[name], int(turns[row_of[name]])) for name, source in made_from.items())
         if todo and any(path.parent.glob(f"{path.name.partition('-')[0]}-*.h5")):
             log.warning("%s: features in .h5 files, of an older version of the toolkit, are not used.", path.parent)
@@ -338,7 +338,7 @@ def match_sessions(
     """
     made_by = {"features": [store.settings for store in stores], "matcher": matcher.settings}
     path = matches_path(out, *sessions, made_by)
-    with Items(path, made_by, again=not skip_existing) as items:
+    with Items(path, made_by, skip_existing=skip_existing) as items:
         readable = dict.fromkeys((name0, name1) for name0, name1 in pairs if name0 in stores[0] and name1 in stores[1])
         sources = (stores[0].made_from[first] + stores[1].made_from[second] for first, second in readable)
         todo = items.left((match_name(*names), source, *names) for names, source in zip(readable, sources, strict=True))

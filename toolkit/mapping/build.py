@@ -337,7 +337,7 @@ class MapPlan(Remade):
     def match(self, number: int, skip_existing: bool = True, workers: int = 1) -> None:
         """Match the pairs of a tile along epipolar lines; skip pairs that are matched already."""
         pairs, names, made_from = self.pairs_of[number].tolist(), self.names, self._made_from
-        with Items(self._matches_path(number), self._matches_made_by(number), again=not skip_existing) as items:
+        with Items(self._matches_path(number), self._matches_made_by(number), skip_existing=skip_existing) as items:
             todo = items.left((match_name(names[i], names[j]), made_from[i] + made_from[j], i, j) for i, j in pairs)
             label = f"match {self.session.id}" + (f" {number + 1}/{len(self.tiles)}" if len(self.tiles) > 1 else "")
             todo = items.distribute(_match_share, todo, (self.of_worker,), label, "pair")

@@ -40,7 +40,7 @@ class LocalizedFrames:
     """(N,) number of the piece of odometry; losses of tracking separate pieces."""
     single: dict[int, QueryResult]
     """Estimate from each picture alone, by frame."""
-    again: dict[int, QueryResult]
+    relocalized: dict[int, QueryResult]
     """Estimates of doubtful pictures that were localized again near their predicted pose, by frame."""
 
 
@@ -100,7 +100,7 @@ def localize_sequence(
         )
     localize = partial(_localize, map_, rig_from_cams, turns)
     single = {frame: localize(image, cams_of_frames[frame]) for frame, image in enumerate(images) if image is not None}
-    piece, again = np.zeros(len(odometry), int), dict[int, QueryResult]()
+    piece, relocalized = np.zeros(len(odometry), int), dict[int, QueryResult]()
     placed = list[PlacedPiece]()
     pieces, queries = odometry.split(), queries_of(single)
     if not settings.online:
@@ -114,12 +114,12 @@ def localize_sequence(
         piece[rows] = number
         frames = np.array([frame for frame in single if rows.start <= frame < rows.stop], np.int64)
 
-        def localize_again(todo: Sequence[tuple[int, RoughPose]], start: int = rows.start) -> list[QueryResult]:
+        def relocalize(todo: Sequence[tuple[int, RoughPose]], start: int = rows.start) -> list[QueryResult]:
             return [localize(images[start + frame], cams_of_frames[start + frame], near) for frame, near in todo]
 
-        relocalize = localize_again if settings.relocalize else None
-        done = localize_piece(odometry.part(rows), queries.part(rows), frames - rows.start, settings, relocalize)
-        again |= {rows.start + frame: estimate for frame, estimate in done.again.items()}
+        again = relocalize if settings.relocalize else None
+        done = localize_piece(odometry.part(rows), queries.part(rows), frames - rows.start, settings, again)
+        relocalized |= {rows.start + frame: estimate for frame, estimate in done.relocalized.items()}
         placed.append(done.placed)
     return LocalizedFrames(
         np.concatenate([np.zeros((0, 4, 4)), *(part.world_from_rig for part in placed)]),
@@ -127,7 +127,7 @@ def localize_sequence(
         np.concatenate([np.zeros(0, object), *(part.status for part in placed)]),
         piece,
         single,
-        again,
+        relocalized,
     )
 
 
@@ -205,10 +205,10 @@ class SequenceLocalizer:
         self._drop_before(cut(self._motion, self._queries, self._drift)[-1].start)
         offline = self._drift.model_copy(update={"online": False, "length_s": None})
 
-        def localize_again(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
+        def relocalize(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
             return [self._localize(image, cameras, near) for _, near in todo]
 
-        again = localize_again if self.settings.relocalize else None
+        again = relocalize if self.settings.relocalize else None
         done = localize_piece(self._motion, self._queries, np.array([len(self._motion) - 1]), offline, again)
         self._queries, placed = done.queries, done.placed
         self._solved = len(self._motion) - 1, placed

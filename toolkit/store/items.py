@@ -76,12 +76,12 @@ class Items(Mapping[str, dict[str, NDArray[Any]]]):
     Reading is thread-safe; one thread adds items. They can be read when the context ends, or after `flush`.
     """
 
-    def __init__(self, folder: str | Path, made_by: Any = None, again: bool = False, since: int = 0) -> None:
+    def __init__(self, folder: str | Path, made_by: Any = None, skip_existing: bool = True, since: int = 0) -> None:
         """Open a folder, which need not exist.
 
         Args:
             made_by: settings, JSON, stored with new items; None: those of the items that are there.
-            again: make all items again: `left` returns also those that are there.
+            skip_existing: False: make all items again; `left` returns also those that are there.
             since: number of the first shard whose items need not be made again, for a worker.
         """
         self.folder, self.made_by = Path(folder), made_by
@@ -90,7 +90,7 @@ class Items(Mapping[str, dict[str, NDArray[Any]]]):
         self._added: dict[str, tuple[str, Any, bytes]] = {}
         self._bytes, self._written = 0, time.monotonic()
         self.refresh()
-        self._since = self._next_number() if again else since
+        self._since = since if skip_existing else self._next_number()
 
     def refresh(self) -> None:
         """Find the shards that this and other processes have written since."""
