@@ -1048,7 +1048,7 @@ class Learned:
 
     name, upright = "learned", True
     inputs: Literal["images"] = "images"
-    least_side: int | None = None
+    min_side: int | None = None
 
     def __init__(self, vector: np.ndarray) -> None:
         self.vector = vector
@@ -1077,7 +1077,7 @@ def test_a_learned_embedder_is_given_colors(small_capture: Path, finished: tuple
     place.search.embedders = [learned]  # type: ignore[misc]
     np.testing.assert_array_equal(localize_image(place, path, camera).world_from_rig, expected.world_from_rig)
     assert learned.seen == [(camera.height, camera.width, 3)]
-    learned.least_side = camera.height // 4
+    learned.min_side = camera.height // 4
     np.testing.assert_array_equal(localize_image(place, path, camera).world_from_rig, expected.world_from_rig)
     assert learned.seen[1] == (camera.height // 4, camera.width // 4, 3), "as the stage decodes it"
     place.search.embedders = [Learned(np.zeros(7, np.float32))]  # type: ignore[misc]

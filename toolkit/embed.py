@@ -334,7 +334,7 @@ def _embed_into(
                 return row, store.failed.get(name, "no local features were extracted")
             return row, embedder.prepare(store[name])
         try:
-            image = read_image(session.image_path(row), least_side=embedder.least_side)
+            image = read_image(session.image_path(row), min_side=embedder.min_side)
         except ImageError as error:
             return row, str(error)
         return row, embedder.prepare(turn_image(image, int(part.turns[at])))

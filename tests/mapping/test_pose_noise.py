@@ -41,9 +41,9 @@ def test_windows_matched_with_their_neighbors_are_no_noise_of_exact_poses(shifte
 
 
 def test_noise_is_measured_beside_wrong_matches() -> None:
-    for shifted, most_deg in ((0.0, 0.45), (0.2, 0.6)):
+    for shifted, max_deg in ((0.0, 0.45), (0.2, 0.6)):
         found = [survey(seed, shifted, turn_deg=0.3).noise(1.0) for seed in range(4)]
-        assert 0.2 < np.median([noise.rotation_deg for noise in found]) < most_deg
+        assert 0.2 < np.median([noise.rotation_deg for noise in found]) < max_deg
 
 
 def test_two_cameras_that_almost_have_one_center() -> None:

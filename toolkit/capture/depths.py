@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 # Largest time between a photograph and the depth map of another sensor: half the period of the slowest, at 5 Hz.
 MAX_OFFSET_US = 100_000
 MAX_GAP_US = 1_000_000  # largest time between two poses of a sensor to interpolate between them
-_MOST_POINTS = 30_000  # per depth map; enough for a few hundred features
+_MAX_POINTS = 30_000  # per depth map; enough for a few hundred features
 _HIDDEN = 1.1  # a point deeper than its nearest neighbor by this factor is occluded, or on an edge
 _CELL = 1.5  # width of a cell, in point spacings; only the nearest point of a cell is visible
 _FITTED = 8  # points that a plane is fitted to
@@ -221,7 +221,7 @@ class DepthMaps:
         if not resized and (width, height) != (camera.width, camera.height):
             expected = f"{camera.width} x {camera.height}" + (", or that aspect ratio" if source.camera is None else "")
             raise CaptureError(f"Depth map {path}: found {width} x {height} pixels, expected {expected}.")
-        step = int(np.ceil(np.sqrt(max(np.count_nonzero(depth) / _MOST_POINTS, 1.0))))
+        step = int(np.ceil(np.sqrt(max(np.count_nonzero(depth) / _MAX_POINTS, 1.0))))
         y, x = np.nonzero(depth[step // 2 :: step, step // 2 :: step])
         y, x = y * step + step // 2, x * step + step // 2
         size = np.array([camera.width / width, camera.height / height])

@@ -30,7 +30,7 @@ class Embedder(Protocol):
     """Input of `embed`: images (H, W, 3) uint8 RGB, or `toolkit.features.features.LocalFeatures`."""
     upright: bool
     """Whether it was trained on upright photographs, so that images should be turned upright for it."""
-    least_side: int | None
+    min_side: int | None
     """Pixels that the shorter side of an image must keep; larger images may be decoded smaller, see `read_image`. None:
     always decode at full size."""
 

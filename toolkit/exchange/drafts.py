@@ -95,7 +95,7 @@ AXES = {"opencv": np.eye(4), "opengl": np.diag([1.0, -1.0, -1.0, 1.0])}
 """named_from_cam (4, 4) for each named convention of camera axes: `opencv`, the toolkit's own, has x right, y down, z
 forward; `opengl` has x right, y up, z backward."""
 _AXES = {"opencv": "camera x right, y down, z forward", "opengl": "camera x right, y up, z backward"}
-_MOST_FOR_UP = 300  # cameras that tell what is up
+_MAX_FOR_UP = 300  # cameras that tell what is up
 
 
 @dataclass(kw_only=True)
@@ -490,7 +490,7 @@ class Draft(Options):
             self.rows.append(dict(zip(columns, (image.name, "imported", *values), strict=True)))
         self.rows = [row | {"image": printable(row["image"]), "status": printable(row["status"])} for row in self.rows]
         table = pd.DataFrame(self.rows, columns=columns).astype({"timestamp": "Int64"})
-        posed = list(self._camera_poses(self.images[:: max(1, len(self.images) // _MOST_FOR_UP)]).values())
+        posed = list(self._camera_poses(self.images[:: max(1, len(self.images) // _MAX_FOR_UP)]).values())
         axis = ", ".join(f"{value + 0.0:.2f}" for value in up_of_cameras(posed))
         how = "a guess: all look along -z" if look_down_z(np.reshape(posed, (-1, 4, 4))) else "as most cameras are held"
         by = f"z, {self.record['up']}" if "up" in self.record else f"({axis}), {how}"

@@ -59,7 +59,7 @@ CHANGES = ("rescued", "broken")
 _KEY = ["timestamp", "device_id"]
 BEYOND = 5
 """Error, in stated deviations, beyond which the stated deviation is too small: no chance explains it."""
-FEWEST_FOR_MEDIANS = 30
+MIN_FOR_MEDIANS = 30
 """Poses needed to draw the medians of tenths."""
 RELIABILITY_BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0)
 
@@ -437,7 +437,7 @@ def draw_deviations(errors: pd.DataFrame, unit: str = "m") -> "Figure":
             beyond = float(np.mean(actual[chosen] > BEYOND * stated[chosen]))
             label = f"{name}: {chosen.sum()}, {percent(beyond)} % above"
             axis.plot(stated[chosen], actual[chosen], "o", ms=3.5, alpha=0.5, mew=0, color=color, label=label)
-    if len(stated) >= FEWEST_FOR_MEDIANS:
+    if len(stated) >= MIN_FOR_MEDIANS:
         tenths = np.array_split(np.argsort(stated), 10)
         medians = np.array([(np.median(stated[tenth]), np.median(actual[tenth])) for tenth in tenths])
         axis.plot(*medians.T, color="0.15", lw=1.5, marker="o", ms=3, label="medians of tenths of the poses")

@@ -467,25 +467,25 @@ class View:
     """File that is black where to extract no features, of the image's size; None: no mask."""
     _decoded: dict[tuple[bool, int | None], NDArray[np.uint8]] = field(default_factory=dict, repr=False, compare=False)
 
-    def read(self, color: bool, least_side: int | None = None) -> NDArray[np.uint8]:
+    def read(self, color: bool, min_side: int | None = None) -> NDArray[np.uint8]:
         """Return the pixels in color, (H, W, 3), or gray, (H, W), decoded once; see `capture.images.read_image`.
 
         Raises:
             ImageError: the image cannot be read.
             CameraError: the image has another size than its camera.
         """
-        if (color, least_side) not in self._decoded:
-            pixels = pixels_of(self.image, not color, least_side)
+        if (color, min_side) not in self._decoded:
+            pixels = pixels_of(self.image, not color, min_side)
             width, height = pixels.shape[1::-1]
-            if least_side is not None and isinstance(self.image, Path):  # perhaps decoded at a smaller size
+            if min_side is not None and isinstance(self.image, Path):  # perhaps decoded at a smaller size
                 width, height = stored_size(self.image)
             if (self.camera.width, self.camera.height) != (width, height):
                 raise CameraError(
                     f"The image is {width} x {height} pixels, its camera {self.camera.width} x "
                     f"{self.camera.height}. Give the intrinsics of the image as it is stored."
                 )
-            self._decoded[color, least_side] = pixels
-        return self._decoded[color, least_side]
+            self._decoded[color, min_side] = pixels
+        return self._decoded[color, min_side]
 
     def extract(self, method: AnyMethod) -> LocalFeatures:
         """Return the local features of one kind; see `read` and `usable` for the errors."""
@@ -729,7 +729,7 @@ class RigQuery:
         points: Floats,
         max_error_deg: float,
         seed: int,
-        least_inliers: int = 0,
+        min_inliers: int = 0,
         max_trials: int = MAX_RANSAC_TRIALS,
     ) -> Floats | None:
         """Return the pose rig_from_world (4, 4) with the most inliers, by LO-RANSAC (PoseLib), or None.
@@ -741,7 +741,7 @@ class RigQuery:
             points: (P, 3) the map points.
             max_error_deg: inlier threshold, as an angle.
             seed: of the random generators.
-            least_inliers: RANSAC may miss poses with fewer inliers, which saves time.
+            min_inliers: RANSAC may miss poses with fewer inliers, which saves time.
             max_trials: largest number of samples.
         """
         if len(np.unique(matches.point)) < 4:
@@ -750,10 +750,10 @@ class RigQuery:
             chosen = np.random.default_rng(seed).permutation(len(matches))
             kept = np.zeros(len(matches), bool)
             kept[chosen[:MAX_RANSAC_MATCHES]] = True
-            least_inliers = least_inliers * MAX_RANSAC_MATCHES // len(matches)
+            min_inliers = min_inliers * MAX_RANSAC_MATCHES // len(matches)
             matches = matches[kept]
-        least_share = np.clip(least_inliers / len(matches), 1e-3, 0.99)
-        trials = np.log(1 - RANSAC_CONFIDENCE) / np.log1p(-(least_share**3))  # to draw one sample of three inliers
+        min_share = np.clip(min_inliers / len(matches), 1e-3, 0.99)
+        trials = np.log(1 - RANSAC_CONFIDENCE) / np.log1p(-(min_share**3))  # to draw one sample of three inliers
         options = {
             "success_prob": RANSAC_CONFIDENCE,
             "dyn_num_trials_mult": 1.0,

@@ -72,7 +72,7 @@ MORE = 3.0
 """Such a camera fits if its odds of an inlier, times the cells that have one, are so many times those of the stated.
 A wrong camera fits a part of the image: where focal lengths, distortions or principal points are absurd, or images are
 cropped off-center, the ratio is 4.5 and more; of right cameras by night, where windows repeat, at most 2.6."""
-LEAST = 12  # its inliers must be more than these
+MIN_INLIERS = 12  # its inliers must be more than these
 FEW = 0.3  # share of inliers among the matches below which other cameras are tried if the first step is certain
 VERY_FEW = 0.2  # share below which they are tried in any case
 TRIALS = 1000  # samples of their RANSAC
@@ -565,7 +565,7 @@ def _try_cameras(stated: "_Problem", start: "_Estimate", inliers: Bools) -> Intr
             continue
         problem = _Problem(query, stated.matches, stated.points, stated.max_error_deg)
         fitted = problem.fit(_Estimate(pose, np.zeros(problem.unknowns - 6)), ~np.zeros(problem.unknowns, bool))
-        if fitted is not None and (found := problem.inliers(fitted)).sum() > LEAST and fit_of(found) > best:
+        if fitted is not None and (found := problem.inliers(fitted)).sum() > MIN_INLIERS and fit_of(found) > best:
             best = fit_of(found)
             changes = np.array(list(map(_change, stated.query.cameras, cameras, fitted.parameters.reshape(-1, 4))))
             # If it is nearly the stated camera, the fit will tell.

@@ -476,7 +476,7 @@ class PnpLocalizer(Localizer):
         best = sorted(seen_in, key=lambda index: -int(seen_in[index].sum()))
         for index in best[:CONTESTED_REFERENCES]:
             some = matches[seen_in[index]]
-            start = self._ransac(query, some, self.settings.ransac_max_error_deg, least_inliers=5)
+            start = self._ransac(query, some, self.settings.ransac_max_error_deg, min_inliers=5)
             self._add(query, matches, hypotheses, start, 1.0)
 
     def _add_neighbor(self, query: RigQuery, matches: Matches, hypotheses: list[_Hypothesis]) -> None:
@@ -679,8 +679,8 @@ class PnpLocalizer(Localizer):
         shifts = geometry.small_motions(best.rig_from_world @ poses) if near else np.zeros((0, 6))
         return np.asarray((shifts.T * (odds / (1 + odds.sum()))) @ shifts, np.float64)
 
-    def _ransac(self, query: RigQuery, matches: Matches, max_error_deg: float, least_inliers: int = 0) -> Floats | None:
-        return query.ransac(matches, self.map.points, max_error_deg, self.seed, least_inliers)
+    def _ransac(self, query: RigQuery, matches: Matches, max_error_deg: float, min_inliers: int = 0) -> Floats | None:
+        return query.ransac(matches, self.map.points, max_error_deg, self.seed, min_inliers)
 
 
 def least_squares_covariance(

@@ -41,7 +41,7 @@ from toolkit.threads import fixed_sums
 
 WIDE_BASELINE = 0.25  # baseline over depth; a wider one counts no more
 NEAR_DUPLICATE = 0.03  # baseline over depth; below, two images are near-duplicates
-LEAST_SIMILARITY = 0.25  # similarity of the worst candidate, where that of the best one is 1
+MIN_SIMILARITY = 0.25  # similarity of the worst candidate, where that of the best one is 1
 ALL_SHARED = 50  # shared points from which two images count as fully covisible
 _LAST = 1e-3  # factor that puts near-duplicates and images without shared view last
 FOCAL_TOLERANCE = 0.2
@@ -88,7 +88,7 @@ def select_references(
         return np.zeros(0, np.int64)
     score, poses = score[usable], poses[usable]
     spread = score.max() - score.min()
-    similarity = LEAST_SIMILARITY + (1 - LEAST_SIMILARITY) * (score - score.min()) / (spread if spread > 0 else 1.0)
+    similarity = MIN_SIMILARITY + (1 - MIN_SIMILARITY) * (score - score.min()) / (spread if spread > 0 else 1.0)
     if spread == 0:
         similarity[:] = 1.0
     shared = _shared_view(poses, [cameras[int(index)] for index in usable], depth_m)

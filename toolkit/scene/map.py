@@ -58,7 +58,7 @@ from toolkit.pose.local_triangulation import OnDemandLocalizer, PosedImages
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import RIVAL_DISTANCE, PnpLocalizer, bounded_by_rivals, clarity_of_support
 from toolkit.prediction.feed_forward import FeedForwardLocalizer, depth_of_images
-from toolkit.prediction.hybrid import MOST_FEATURES, DepthLifter, HybridLocalizer, lifts
+from toolkit.prediction.hybrid import MAX_FEATURES, DepthLifter, HybridLocalizer, lifts
 from toolkit.prediction.interface import Predictor
 from toolkit.prediction.network import open_predictor
 from toolkit.results.metrics import UNKNOWN_UNIT, length_unit
@@ -540,7 +540,7 @@ class Map:
         if not settings.predicts:
             if lifts(settings, self.session):
                 of_image = depth_of_images(self.session, pnp.image_names, self.length)
-                pnp.lift = DepthLifter(pnp, of_image, MOST_FEATURES).localize
+                pnp.lift = DepthLifter(pnp, of_image, MAX_FEATURES).localize
             return pnp
         predictor = self.predictor or open_predictor(settings, self.capture, self.map_dir)
         unit = ("m", 1 / self.length) if self.settings.unit else (UNKNOWN_UNIT, 1.0)
@@ -763,7 +763,7 @@ class ReferenceSearch:
 
     def _inputs(self, embedder: Embedder, query: Query, kinds: Sequence[LocalMethod]) -> list[Any]:
         if embedder.inputs != "features":
-            turned, side = shows_upright(embedder, self.embed_settings.upright), embedder.least_side
+            turned, side = shows_upright(embedder, self.embed_settings.upright), embedder.min_side
             images = (turn_image(view.read(True, side), view.turns if turned else 0) for view in query.views)
             return [embedder.prepare(image) for image in images]
         sift, settings = self._sift, [kind.extractor.settings for kind in kinds]
