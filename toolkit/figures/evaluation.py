@@ -366,14 +366,14 @@ def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = TH
         marks = sorted({threshold[1 - row] for threshold in thresholds})
         low, high = min([*finite, *marks]), max([*finite, *marks])
         for axis, query in zip(axes[row], queries, strict=True):
-            for map_ in maps:
-                values = errors.loc[(errors.query_device == query) & (errors.map_device == map_), column]
+            for mapped in maps:
+                values = errors.loc[(errors.query_device == query) & (errors.map_device == mapped), column]
                 if not len(values):
                     continue
                 ascending = np.sort(values[np.isfinite(values)].to_numpy(float).clip(1e-4))
                 share = 100 * np.arange(len(ascending) + 1) / len(values)
                 axis.step([low / 2, *ascending, high * 2], [*share, share[-1]], where="post", lw=1.8,
-                          color=color_of(map_), label=f"{map_} map")  # fmt: skip
+                          color=color_of(mapped), label=f"{mapped} map")  # fmt: skip
             for mark in marks:
                 axis.axvline(mark, color="0.45", lw=0.9, ls=":", label="thresholds" if mark == marks[0] else None)
             axis.set(xscale="log", xlim=(low / 1.5, high * 1.5), ylim=(0, 102), xlabel=label)

@@ -45,7 +45,7 @@ class LocalizedFrames:
 
 
 def _localize(
-    map_: Map,
+    scene_map: Map,
     rig_from_cams: NDArray[np.float64] | None,
     turns: Sequence[int] | None,
     picture: Images,
@@ -54,7 +54,7 @@ def _localize(
 ) -> QueryResult:
     """Localize the picture of a frame, alone or near a pose. A picture that cannot be read gives `failed`."""
     try:
-        return localize_image(map_, picture, cameras, rig_from_cams, turns, near=near)
+        return localize_image(scene_map, picture, cameras, rig_from_cams, turns, near=near)
     except CameraError:
         raise
     except ImageError as error:
@@ -63,7 +63,7 @@ def _localize(
 
 @fixed_sums
 def localize_sequence(
-    map_: Map,
+    scene_map: Map,
     images: Sequence[Images],
     cameras: Cameras | Sequence[Cameras],
     odometry: Odometry,
@@ -74,7 +74,7 @@ def localize_sequence(
     """Localize the N frames of a recording, with and without pictures.
 
     Args:
-        map_: an open map, see `Map.open`.
+        scene_map: an open map, see `Map.open`.
         images: for each frame its picture, the C pictures of a rig, or None.
         cameras: the intrinsics of all pictures, or a list with those of each of the N frames, because they may change
             when a phone focuses. For a rig, each is a sequence of C.
@@ -98,7 +98,7 @@ def localize_sequence(
         raise ValueError(
             f"Found {len(cams_of_frames)} cameras and {len(images)} images: expected one for all, or one per image."
         )
-    localize = partial(_localize, map_, rig_from_cams, turns)
+    localize = partial(_localize, scene_map, rig_from_cams, turns)
     single = {frame: localize(image, cams_of_frames[frame]) for frame, image in enumerate(images) if image is not None}
     piece, relocalized = np.zeros(len(odometry), int), dict[int, QueryResult]()
     placed = list[PlacedPiece]()
@@ -141,14 +141,14 @@ class SequenceLocalizer:
 
     def __init__(
         self,
-        map_: Map,
+        scene_map: Map,
         settings: SequenceSettings | dict[str, Any] | None = None,
         rig_from_cams: NDArray[np.float64] | None = None,
         turns: Sequence[int] | None = None,
     ) -> None:
         """See `localize_sequence`; `settings.length_s` is the window."""
         self.settings = self._drift = SequenceSettings.of({"online": True}, settings)
-        self._localize = partial(_localize, map_, rig_from_cams, turns)
+        self._localize = partial(_localize, scene_map, rig_from_cams, turns)
         self._motion = Odometry(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
         """Frames of the window."""
         self._queries = queries_of({})
