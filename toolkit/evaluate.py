@@ -417,7 +417,7 @@ def _retrieval_recall(
 ) -> tuple[dict[str, Any], NDArray[np.bool_] | None]:
     """Return a pair's row of the table `retrieval`, and whether each query has a good reference (None if unreadable).
 
-    `length` is the table's unit of lengths, and `map_length` is `Survey.length`, in the unit of the poses: far scenes
+    `length` is the table's unit of lengths, and `map_length` is `LocalMap.length`, in the unit of the poses: far scenes
     show the same from further apart.
     """
     if not path.is_file():

@@ -70,7 +70,7 @@ _FROM_OTHERS = ("inlier_ratio", "position_std", "rotation_std_deg")
 SEARCH_DEG = (1.0, 6.0)
 """Smallest and largest radius of the search for keypoints around the projections of a prior pose, degrees."""
 NEARBY_M = 3.0
-"""Assumed depth of the scene, in map lengths (see `Survey.length`), to turn the uncertainty of a position into an
+"""Assumed depth of the scene, in map lengths (see `LocalMap.length`), to turn the uncertainty of a position into an
 angle."""
 MAX_STATUS = 70
 """Letters of a status that tables and titles show; the tables of the poses have all of it."""

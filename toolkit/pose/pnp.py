@@ -132,7 +132,7 @@ def bounded_by_deviation(probability: float, position_std: float, rotation_std_d
 
     Args:
         probability: that of the pose without this bound.
-        position_std: of the pose, map lengths, see `Survey.length`, as in `EVIDENCE`.
+        position_std: of the pose, map lengths, see `LocalMap.length`, as in `EVIDENCE`.
         rotation_std_deg: of the pose.
     """
     stds = MARGIN * np.array([position_std, rotation_std_deg]) / np.sqrt(3)

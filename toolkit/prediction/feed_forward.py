@@ -177,7 +177,7 @@ class FeedForwardLocalizer(Localizer):
         length: float = 1.0,
         unit: tuple[str, float] = ("m", 1.0),
     ):
-        """Depths of the depth maps of the map's session are divided by `length`, see `Survey.length`; `turns` make
+        """Depths of the depth maps of the map's session are divided by `length`, see `LocalMap.length`; `turns` make
         images upright for the predictor; `unit` is the one that lengths are shown in, with its length in the map.
         """
         self.map, self.predictor, self.unit = local_map, predictor, unit
@@ -329,7 +329,7 @@ class FeedForwardLocalizer(Localizer):
 
 def depth_of_images(session: Session, names: Sequence[str], length: float = 1.0) -> Callable[[int], SeenDepth]:
     """Return a function that returns the depth of a map image, by its index in `names`, from the session's depth maps,
-    divided by `length`, see `Survey.length`.
+    divided by `length`, see `LocalMap.length`.
     """
     depths = DepthMaps(session)
 

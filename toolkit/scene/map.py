@@ -88,7 +88,7 @@ log = logging.getLogger(__name__)
 WITHOUT_FEATURES = ("feed_forward", "nearest")
 """Methods that need no local features of the queries."""
 NEAR, NEAR_DEG = 10.0, 60.0
-"""Largest distance (in map lengths, see `Survey.length`) and angle (degrees) between a camera and a map image that may
+"""Largest distance (map lengths, see `LocalMap.length`) and angle (degrees) between a camera and a map image that may
 show the same scene."""
 MAX_SURE_STD_M = 0.05
 """An `ok` pose with at most this standard deviation of the position, meters, is precise enough. Otherwise the fallback
@@ -647,7 +647,7 @@ class Map:
 
     @property
     def length(self) -> float:
-        """The length that localizers treat as one meter, in the unit of the poses; see `Survey.length`."""
+        """The length that localizers treat as one meter, in the unit of the poses; see `LocalMap.length`."""
         return self._first.length if self._first else 1.0
 
     @cached_property
