@@ -86,7 +86,7 @@ class ImageError(ToolkitError):
 
 
 class CameraError(ImageError):
-    """A camera, or a camera's pose or turn, is invalid or does not fit the pictures."""
+    """A camera, or a camera's pose or turn, is invalid or does not fit the images."""
 
 
 class WeightsError(ToolkitError):

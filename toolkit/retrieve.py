@@ -126,7 +126,7 @@ def retrieve_pairs(
                 }
                 masks, without = _masks(settings, poses, database, query)
                 skipped = skip_existing and is_current(path, record)
-                # Single photographs that are localized later search the map's index, too.
+                # Single images that are localized later search the map's index, too.
                 skipped = skipped and is_index_current(embeddings, database.session.id, database.vectors, settings)
                 if not skipped:
                     _require_same_dimension(query, database)

@@ -55,7 +55,7 @@ NO_FILE = "no such file"
 EXIF_CAMERA = (0x010F, 0x0110, _FOCAL_MM, _FOCAL_35MM)
 """EXIF tags that distinguish cameras: make, model and focal lengths."""
 _FILM_DIAGONAL_MM = float(np.hypot(36, 24))
-CAMERA_TYPES = ("camera", "depth")  # sensor types with intrinsics; only `camera` takes photographs
+CAMERA_TYPES = ("camera", "depth")  # sensor types with intrinsics; only `camera` takes images
 WIDE = ("FISHEYE", "FOV", "EUCM")  # ends of the names of models for fields of view of 180 degrees and more
 _LARGEST = 2**31 - 1  # largest image side, pixels; COLMAP cannot hold larger numbers
 

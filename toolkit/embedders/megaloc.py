@@ -1,4 +1,4 @@
-"""MegaLoc as an embedder: resizes photographs of any size and embeds them in batches, on any device."""
+"""MegaLoc as an embedder: resizes images of any size and embeds them in batches, on any device."""
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy

@@ -79,8 +79,8 @@ READ_SUFFIXES = (*IMAGE_SUFFIXES, ".webp", ".tif", ".tiff", ".bmp", ".jp2")
 HEIC_SUFFIXES = (".heic", ".heif")
 CONVERTED_SUFFIXES = (*READ_SUFFIXES[len(IMAGE_SUFFIXES) :], *HEIC_SUFFIXES, ".gif", ".avif")
 """Formats that a reconstruction converts to PNG; HEIC needs the package pillow-heif."""
-PHOTOGRAPHS = (*IMAGE_SUFFIXES, *CONVERTED_SUFFIXES, ".dng", ".cr2", ".nef", ".arw")
-"""Formats of photographs, read or not."""
+KNOWN_SUFFIXES = (*IMAGE_SUFFIXES, *CONVERTED_SUFFIXES, ".dng", ".cr2", ".nef", ".arw")
+"""Formats of images, read or not."""
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 PLACING = ("link", "copy")
 EXIF = "exif"
@@ -751,7 +751,7 @@ def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES, draft:
     names = [name for name in names if name not in set(broken)] if broken else names
     others = {"its name is not UTF-8: rename it": broken} if broken else {}
     for name in files:
-        if (suffix := name[name.rfind(".") :].lower()) in PHOTOGRAPHS and suffix not in suffixes:
+        if (suffix := name[name.rfind(".") :].lower()) in KNOWN_SUFFIXES and suffix not in suffixes:
             how = HEIC_HOW if suffix in HEIC_SUFFIXES else CONVERT
             others.setdefault(f"{suffix} is not read: {how}", []).append(name)
     note = [f"captures in the folder of images are skipped: {', '.join(captures[:3])}"] if captures else []
@@ -787,7 +787,7 @@ def walk_files(folder: Path) -> tuple[list[str], list[str]]:
 
 
 def write_png(source: Path, target: Path) -> None:
-    """Write a photograph in another format as PNG with its EXIF tags. Raise `images.HEADER_ERRORS` if it is none."""
+    """Write an image in another format as PNG with its EXIF tags. Raise `images.HEADER_ERRORS` if it is none."""
     with PIL.Image.open(source) as image:
         pixels, exif = image.convert("RGB"), image.getexif()  # in this order: Pillow turns a TIFF upright
     pixels.save(target, "PNG", exif=exif)
@@ -816,7 +816,7 @@ def _composed(name: str) -> str:
 def _loose(name: str) -> str:
     name = _composed(name).replace("\\", "/").casefold()
     stem, dot, suffix = name.rpartition(".")
-    return stem if f"{dot}{suffix}" in PHOTOGRAPHS else name
+    return stem if f"{dot}{suffix}" in KNOWN_SUFFIXES else name
 
 
 def _is_mask(name: str) -> bool:

@@ -270,8 +270,8 @@ def _extract(
     if extractor.threaded:
         yield from prefetch(read_and_extract, images, workers)
         return
-    pictures = prefetch(read, (row for row, _ in images), workers, ahead=2 * extractor.batch_size)
-    turned = zip(pictures, images, strict=True)
+    pixels = prefetch(read, (row for row, _ in images), workers, ahead=2 * extractor.batch_size)
+    turned = zip(pixels, images, strict=True)
     while batch := list(islice(turned, extractor.batch_size)):
         readable = [(image, turns) for image, (_, turns) in batch if not isinstance(image, str)]
         features = iter(extract_turned(extractor, *zip(*readable, strict=True)) if readable else [])

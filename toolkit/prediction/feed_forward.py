@@ -388,9 +388,9 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...], image_names: Seque
 
 
 def _other_focal(prediction: Prediction, cameras: Sequence[pycolmap.Camera]) -> float:
-    """Return the predicted focal length of the first photograph of a group if it contradicts the camera, else NaN.
+    """Return the predicted focal length of the first image of a group if it contradicts the camera, else NaN.
 
-    A network errs by some percent, equally for all photographs of a group, so the references give its error.
+    A network errs by some percent, equally for all images of a group, so the references give its error.
     """
     if prediction.intrinsics is None:
         return np.nan
