@@ -54,10 +54,10 @@ class Way(NamedTuple):
 
     degraded: bool = False
     """Whether query images are degraded, each in a way drawn from `DEGRADATIONS`."""
-    most_rotation_deg: float = 0.0
-    most_shift: float = 0.0
+    max_rotation_deg: float = 0.0
+    max_shift: float = 0.0
     """Standard deviations of the noise of the map's poses are drawn up to these, degrees and meters."""
-    most_focal: float = 0.0
+    max_focal: float = 0.0
     """The focal lengths of the map are too long by a share drawn up to this."""
     defaults: bool = False
     """Whether unsure queries are localized again with learned features."""
@@ -66,8 +66,8 @@ class Way(NamedTuple):
 WAYS = {
     "as it is": Way(),
     "degraded": Way(degraded=True),
-    "map poses": Way(degraded=True, most_rotation_deg=2.0, most_shift=0.03),
-    "map focal length": Way(degraded=True, most_focal=0.15),
+    "map poses": Way(degraded=True, max_rotation_deg=2.0, max_shift=0.03),
+    "map focal length": Way(degraded=True, max_focal=0.15),
     "degraded, defaults": Way(degraded=True, defaults=True),
 }
 
@@ -111,8 +111,8 @@ def harden(capture: Path, copy: Path, way: Way, seed: int) -> None:
                 assert image is not None, path
                 cv2.imwrite(str(path), degrade(image.astype(np.uint8), str(rng.choice(DEGRADATIONS)), rng))
             continue
-        rotation_deg, shift = rng.uniform(0, way.most_rotation_deg), rng.uniform(0, way.most_shift)
-        if way.most_rotation_deg:
+        rotation_deg, shift = rng.uniform(0, way.max_rotation_deg), rng.uniform(0, way.max_shift)
+        if way.max_rotation_deg:
             path = session.path / "trajectories.txt"
             given = Trajectory.read(path)
             poses = given.world_from_device
@@ -120,8 +120,8 @@ def harden(capture: Path, copy: Path, way: Way, seed: int) -> None:
             poses[:, :3, :3] = poses[:, :3, :3] @ turns.as_matrix()
             poses[:, :3, 3] += rng.normal(0, shift, (len(poses), 3))
             Trajectory.from_poses(given.timestamps, given.arrow_ids, poses).write(path)
-        if way.most_focal:
-            factor = 1 + rng.uniform(0, way.most_focal)
+        if way.max_focal:
+            factor = 1 + rng.uniform(0, way.max_focal)
             path = session.path / "sensors.txt"
             path.write_text("".join(_longer(line, factor) for line in path.read_text().splitlines(keepends=True)))
     partial.rename(copy)

@@ -232,7 +232,7 @@ def run_toolkit(job: Job, out: Path, precision: str) -> dict[str, Any]:
     session = Capture.from_sessions_root(job.sessions_root)["ios_map"]
     decode = time.perf_counter()
     for row in session.camera_rows.tolist():
-        embedder.prepare(read_image(session.image_path(row), least_side=embedder.least_side))
+        embedder.prepare(read_image(session.image_path(row), min_side=embedder.min_side))
     return {
         "precision": embedder.settings["dtype_compute"],
         "images": int(table["embedded"].sum()),
@@ -352,10 +352,10 @@ def decode_rows(job: Job, folder: Path) -> list[dict[str, Any]]:
             with Image.open(file) as image:
                 image.convert("RGB").resize(size, Image.Resampling.BICUBIC).save(path, quality=92)
         whole = None
-        for least_side in (None, embedder.least_side):
+        for min_side in (None, embedder.min_side):
             row: dict[str, Any] = {"size": f"{size[0]} x {size[1]}"}
-            row["decoded"] = "{1} x {0}".format(*read_image(paths[0], least_side=least_side).shape)
-            prepare = partial(_decoded, image_size=job.image_size, least_side=least_side)
+            row["decoded"] = "{1} x {0}".format(*read_image(paths[0], min_side=min_side).shape)
+            prepare = partial(_decoded, image_size=job.image_size, min_side=min_side)
             many = (paths * DECODE_IMAGES)[: 4 * DECODE_IMAGES]
             for name, pool in (
                 ("one", ThreadPoolExecutor(1)),
@@ -374,13 +374,13 @@ def decode_rows(job: Job, folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _decoded(path: Path, image_size: int, least_side: int | None) -> NDArray[np.uint8]:
+def _decoded(path: Path, image_size: int, min_side: int | None) -> NDArray[np.uint8]:
     """Return what `MegaLocEmbedder.prepare` makes of a file, without a network: for processes of their own."""
     from PIL import Image
 
     from toolkit.capture.images import read_image
 
-    image = Image.fromarray(read_image(path, least_side=least_side))
+    image = Image.fromarray(read_image(path, min_side=min_side))
     return np.asarray(image.resize((image_size, image_size), Image.Resampling.BILINEAR))
 
 
@@ -395,7 +395,7 @@ def gpu_rows(checkout: str, job: Job, precisions: tuple[str, ...], batches: tupl
     files = sorted(job.sessions_root.glob("ios_map/raw_data/images/*"))
     embedder = MegaLocEmbedder(job.weights, job.device, precisions[0], job.image_size)
     started = time.perf_counter()
-    images = [embedder.prepare(read_image(path, least_side=embedder.least_side)) for path in files]
+    images = [embedder.prepare(read_image(path, min_side=embedder.min_side)) for path in files]
     decode = (time.perf_counter() - started) / len(files)
     official: dict[int, float] = {}
     if checkout:

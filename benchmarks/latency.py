@@ -67,7 +67,7 @@ def measure(sessions_root: Path, run: Path, mapped: str, asked: str, pictures: i
     from toolkit.localize import Map, localize_image
 
     imported = _clocks()
-    place = Map.open(run, sessions_root.parent.name, mapped)
+    scene_map = Map.open(run, sessions_root.parent.name, mapped)
     opened = _clocks()
     session = Capture.from_sessions_root(sessions_root)[f"{asked}_query"]
     table = pd.read_csv(SceneFiles(run, sessions_root.parent.name).poses_csv(mapped, asked))
@@ -78,9 +78,9 @@ def measure(sessions_root: Path, run: Path, mapped: str, asked: str, pictures: i
     for rows in [members[index] for index in (chosen[escalated.argmax()], *chosen)]:  # the first one needs all networks
         paths = [session.image_path(int(row)) for row in rows]
         cameras = session.cameras(rows)
-        turns = None if place.turns is None else place.turns.of(session, rows)
+        turns = None if scene_map.turns is None else scene_map.turns.of(session, rows)
         started = _clocks()
-        ok.append(localize_image(place, paths, cameras, session.rig_from_cam(rows), turns).status == "ok")
+        ok.append(localize_image(scene_map, paths, cameras, session.rig_from_cam(rows), turns).status == "ok")
         times.append(_clocks() - started)
     return {
         "imports": imported - start,

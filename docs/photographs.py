@@ -31,5 +31,5 @@ def run_of(photographs: str | Path) -> Path:
 
 def pair_of(run: Path) -> LocalizedPair:
     """Return the localized queries of such a run."""
-    map_, files = Run.open(run).map("ios"), run / NAME
-    return LocalizedPair.open(map_.capture, "ios", "ios", files / "poses", files / "map")
+    scene_map, files = Run.open(run).map("ios"), run / NAME
+    return LocalizedPair.open(scene_map.capture, "ios", "ios", files / "poses", files / "map")

@@ -146,10 +146,10 @@ def test_learned_features_find_what_sift_is_not_sure_of(
     escalated = rows["first_status"].notna()
     assert (rows["method"][escalated] == "pnp+aliked").all()
     assert (rows["p_correct"] >= 0.99).all()
-    place = Map.open(tmp_path, "STRECHA_HARD", "ios")
+    scene_map = Map.open(tmp_path, "STRECHA_HARD", "ios")
     number = int(np.flatnonzero(escalated)[0])
     (row,) = session.rows_of_keyframes(keyframes)[number]
     camera = session.camera(session.images["sensor_id"].iloc[row])
-    turns = place.turns.of(session, row).tolist()
-    estimate = localize_image(place, session.image_path(int(row)), camera, turns=turns)
+    turns = scene_map.turns.of(session, row).tolist()
+    estimate = localize_image(scene_map, session.image_path(int(row)), camera, turns=turns)
     np.testing.assert_array_equal(geometry.qt_from_pose(estimate.world_from_rig), poses.qt[number])

@@ -148,7 +148,7 @@ def test_support_tells_less_in_a_noisy_map() -> None:
 
 
 def test_a_capture_is_made_hard(confidence: ModuleType, small_capture: Path, tmp_path: Path) -> None:
-    way = confidence.Way(degraded=True, most_rotation_deg=2.0, most_shift=0.03, most_focal=0.15)
+    way = confidence.Way(degraded=True, max_rotation_deg=2.0, max_shift=0.03, max_focal=0.15)
     confidence.harden(small_capture, tmp_path / "hard", way, 0)
     given, hard = Capture.open(small_capture), Capture.open(tmp_path / "hard")
     rotation_deg, shift = pose_error(hard["ios_map"].world_from_cam(), given["ios_map"].world_from_cam())

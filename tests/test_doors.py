@@ -135,7 +135,7 @@ def test_every_door_gives_the_same_poses(
     with no_kernels() if name in IN_OTHERS else nullcontext():
         pipeline.run(manifest, only="localize", say=quiet, in_place=True)
     run = Run.open(files.run)
-    place = run.map(map_device)
+    scene_map = run.map(map_device)
     for query_device in query_devices:
         path = files.poses_txt(map_device, query_device)
         record = map_record_path(files.poses_dir, files.scene, map_device)
@@ -155,15 +155,15 @@ def test_every_door_gives_the_same_poses(
         assert read_map_record(map_record_path(tmp_path / "out_dir", files.scene, map_device))["unit"] == unit
         # one image, or the images of one rig, and inspection
         session = Capture.open(capture)[f"{query_device}_query"]
-        assert place.settings.unit == unit
+        assert scene_map.settings.unit == unit
         inspected = InspectedPair(map_device, query_device, files.poses_dir)
         for number, rows in enumerate(session.rows_of_keyframes(results.table)):
             one = results[number]
             if method.get("predictor") == "simulated":  # it predicts images of the capture only
-                found = place.locate(place.query_of_session(session, rows))
+                found = scene_map.locate(scene_map.query_of_session(session, rows))
             else:
                 paths = [session.image_path(row) for row in rows.tolist()]
-                found = localize_image(place, paths, session.cameras(rows), session.rig_from_cam(rows))
+                found = localize_image(scene_map, paths, session.cameras(rows), session.rig_from_cam(rows))
             shown = inspected.look(number)
             assert shown.result.status_text == found.status_text == one.status_text
             assert shown.unit == results.unit

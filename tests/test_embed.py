@@ -213,7 +213,7 @@ def test_photographs_are_decoded_as_small_as_the_network_allows(
     matrix, manifest = load_embeddings(out / "ios_query")
     embedder = MegaLocEmbedder(tiny_megaloc(), device="cpu", dtype_compute="float32", image_size=126)
     path = tiny.parent / manifest["abs_path"][0]
-    reduced, whole = read_image(path, least_side=embedder.least_side), read_image(path)
+    reduced, whole = read_image(path, min_side=embedder.min_side), read_image(path)
     assert (reduced.shape, whole.shape) == ((280, 392, 3), (560, 784, 3))
     np.testing.assert_allclose(matrix[0], embedder.embed([reduced])[0], atol=1e-6)
     # Half the squared distance is 1 - the cosine, without its rounding.

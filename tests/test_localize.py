@@ -898,17 +898,17 @@ def test_a_picture_is_turned_for_what_the_run_turned_images_for(
     upright: bool | None,
 ) -> None:
     files = finished[0]
-    place = Map.open(files.run, files.scene, "ios")
-    place.settings = LocalizeSettings.of({"method": "feed_forward"})
-    place.search.embed_settings = EmbedSettings.of({"upright": upright})  # type: ignore[misc]
-    learned = Learned(np.ones(place.search._descriptors.shape[1], np.float32))
-    place.search.embedders = [learned]  # type: ignore[misc]
+    scene_map = Map.open(files.run, files.scene, "ios")
+    scene_map.settings = LocalizeSettings.of({"method": "feed_forward"})
+    scene_map.search.embed_settings = EmbedSettings.of({"upright": upright})  # type: ignore[misc]
+    learned = Learned(np.ones(scene_map.search._descriptors.shape[1], np.float32))
+    scene_map.search.embedders = [learned]  # type: ignore[misc]
     asked: list[Query] = []
-    localizer = AsManyAsFeatures(place.mapped)
+    localizer = AsManyAsFeatures(scene_map.mapped)
     localizer.solve = lambda matches, *_: asked.append(matches.query) or QueryResult(Status.OK)  # type: ignore
-    vars(place)["localizer"] = localizer
+    vars(scene_map)["localizer"] = localizer
     camera = pycolmap.Camera(model="PINHOLE", width=10, height=20, params=[10, 10, 5, 10])
-    localize_image(place, np.zeros((20, 10), np.uint8), camera, turns=[1])
+    localize_image(scene_map, np.zeros((20, 10), np.uint8), camera, turns=[1])
     assert learned.seen == [(10, 20, 3) if upright is None else (20, 10, 3)]
     assert asked[0].views[0].turns == 1
 
@@ -939,9 +939,9 @@ def test_a_run_whose_capture_has_moved_opens_after_the_next_run(
     calls = spy(monkeypatch)
     assert run_stage(moved, run, query_device="ios", compute_device="cpu")["skipped"].all()
     assert not calls
-    place = Map.open(run.run, run.scene, "ios")
-    assert place.session.path == moved / "sessions" / "ios_map"
-    assert place.settings.compute_device == "cpu", "as the last run had it"
+    scene_map = Map.open(run.run, run.scene, "ios")
+    assert scene_map.session.path == moved / "sessions" / "ios_map"
+    assert scene_map.settings.compute_device == "cpu", "as the last run had it"
     path = run.poses_txt("ios", "ios").with_suffix(".h5")
     assert all(query.correspondences.agrees.any() for query in PairResults.open(path))
     stamp = path.stat().st_mtime_ns
@@ -966,12 +966,12 @@ def test_a_run_with_a_torn_file_of_correspondences_says_so(
 def test_a_map_without_points_gets_them_for_a_query(small_capture: Path, run: SceneFiles) -> None:
     """It was refused: a run with `nearest` has no features and no points."""
     run_stage(small_capture, run, query_device="ios", method="nearest")
-    place = Map.open(run.run, run.scene, "ios")
-    session = place.capture["ios_query"]
-    query = place.query_of_session(session, session.camera_rows[:1])
+    scene_map = Map.open(run.run, run.scene, "ios")
+    session = scene_map.capture["ios_query"]
+    query = scene_map.query_of_session(session, session.camera_rows[:1])
     references = [References.of(list(range(6)))]
-    assert place.locate(query, references=references).status == "low_confidence"
-    assert place.changed({"method": "pnp", "features": "sift"}).locate(query, references=references).status == "ok"
+    assert scene_map.locate(query, references=references).status == "low_confidence"
+    assert scene_map.changed({"method": "pnp", "features": "sift"}).locate(query, references=references).status == "ok"
 
 
 def test_a_localizer_of_another_method_sees_images_upright_as_its_settings_say(
@@ -1048,7 +1048,7 @@ class Learned:
 
     name, upright = "learned", True
     inputs: Literal["images"] = "images"
-    least_side: int | None = None
+    min_side: int | None = None
 
     def __init__(self, vector: np.ndarray) -> None:
         self.vector = vector
@@ -1070,19 +1070,19 @@ def test_a_learned_embedder_is_given_colors(small_capture: Path, finished: tuple
     files = finished[0]
     session = Capture.open(small_capture)["ios_query"]
     path, camera = session.image_path(0), session.camera(session.images["sensor_id"].iloc[0])
-    place = Map.open(files.run, files.scene, "ios")
-    expected = localize_image(place, path, camera)
+    scene_map = Map.open(files.run, files.scene, "ios")
+    expected = localize_image(scene_map, path, camera)
     store = extract_session(session, files.features)
-    learned = Learned(place.search.embedders[0].embed([store[session.image_name(0)]])[0])
-    place.search.embedders = [learned]  # type: ignore[misc]
-    np.testing.assert_array_equal(localize_image(place, path, camera).world_from_rig, expected.world_from_rig)
+    learned = Learned(scene_map.search.embedders[0].embed([store[session.image_name(0)]])[0])
+    scene_map.search.embedders = [learned]  # type: ignore[misc]
+    np.testing.assert_array_equal(localize_image(scene_map, path, camera).world_from_rig, expected.world_from_rig)
     assert learned.seen == [(camera.height, camera.width, 3)]
-    learned.least_side = camera.height // 4
-    np.testing.assert_array_equal(localize_image(place, path, camera).world_from_rig, expected.world_from_rig)
+    learned.min_side = camera.height // 4
+    np.testing.assert_array_equal(localize_image(scene_map, path, camera).world_from_rig, expected.world_from_rig)
     assert learned.seen[1] == (camera.height // 4, camera.width // 4, 3), "as the stage decodes it"
-    place.search.embedders = [Learned(np.zeros(7, np.float32))]  # type: ignore[misc]
+    scene_map.search.embedders = [Learned(np.zeros(7, np.float32))]  # type: ignore[misc]
     with pytest.raises(ArtifactError, match="expected 7 of learned"):
-        localize_image(place, path, camera)
+        localize_image(scene_map, path, camera)
 
 
 class AsManyAsFeatures(Localizer):
@@ -1101,11 +1101,11 @@ def test_a_method_of_ones_own_is_given_features_as_in_a_run(
     monkeypatch.setattr(maps, "PnpLocalizer", AsManyAsFeatures)
     monkeypatch.setattr(maps, "lifts", lambda *_: False)  # it matches nothing, so nothing could be lifted
     run_stage(small_capture, run, query_device="ios")
-    place = Map.open(run.run, run.scene, "ios")
+    scene_map = Map.open(run.run, run.scene, "ios")
     session = Capture.open(small_capture)["ios_query"]
     row = int(session.rows_of_keyframes(session.keyframes(LIST))[0][0])
     camera = session.camera(session.images["sensor_id"].iloc[row])
-    count = localize_image(place, session.image_path(row), camera).num_matches
+    count = localize_image(scene_map, session.image_path(row), camera).num_matches
     assert count == rows_of(run, "ios")["num_matches"].iloc[0] > 0
 
 
@@ -1159,12 +1159,12 @@ def test_pictures_and_inspections_get_the_pose_of_the_run_byte_for_byte(
     settings = {"features": ["sift"], "seed": 3, "pnp": {"min_inliers": 11}, "predictor": {"num_references": 3}}
     settings |= method
     run_stage(small_capture, run, query_device=device, **settings)
-    place = Map.open(run.run, run.scene, "ios")
-    assert place.settings == LocalizeSettings.of(settings, {"unit": "m"}), "the run's own settings"
+    scene_map = Map.open(run.run, run.scene, "ios")
+    assert scene_map.settings == LocalizeSettings.of(settings, {"unit": "m"}), "the run's own settings"
     session = Capture.open(small_capture)[f"{device}_query"]
     pair = InspectedPair("ios", device, run.poses_dir)
     keyframes = session.keyframes(LIST)
-    quarter_turns = place.turns.of(session) if place.turns else np.zeros(len(session.images), int)
+    quarter_turns = scene_map.turns.of(session) if scene_map.turns else np.zeros(len(session.images), int)
     lines = run.poses_txt("ios", device).read_text().splitlines()[1:]
     localized = PairResults.open(run.poses_txt("ios", device))
     queries = zip(lines, session.rows_of_keyframes(keyframes), keyframes.itertuples(index=False), strict=True)
@@ -1173,9 +1173,9 @@ def test_pictures_and_inspections_get_the_pose_of_the_run_byte_for_byte(
         cameras = [session.camera(sensor) for sensor in session.images["sensor_id"].iloc[rows]]
         rig = session.rig_from_cam(rows)
         estimate = (
-            localize_image(place, paths[0], cameras[0], turns=quarter_turns[rows])
+            localize_image(scene_map, paths[0], cameras[0], turns=quarter_turns[rows])
             if device == "ios"
-            else localize_image(place, paths, cameras, rig, quarter_turns[rows])
+            else localize_image(scene_map, paths, cameras, rig, quarter_turns[rows])
         )
         text = ", ".join(repr(float(number)) for number in geometry.qt_from_pose(estimate.world_from_rig))
         assert text in line, f"{key.timestamp}"
@@ -1223,13 +1223,13 @@ def test_a_picture_is_reranked_as_the_run_was(small_capture: Path, run: SceneFil
     rerank_pairs(sessions, run.retrieval_dir, run.features, run.reranked_dir, settings, map_device="ios")
     folders = (run.reranked_dir, run.poses_dir, run.features, run.maps)
     localize_pairs(sessions, *folders, map_device="ios", query_device="ios", queries=LIST, workers=1)
-    place = Map.open(run.run, run.scene, "ios")
-    assert place.reranked
+    scene_map = Map.open(run.run, run.scene, "ios")
+    assert scene_map.reranked
     session = Capture.open(small_capture)["ios_query"]
     lines = run.poses_txt("ios", "ios").read_text().splitlines()[1:]
     for line, rows in zip(lines, session.rows_of_keyframes(session.keyframes(LIST)), strict=True):
         camera = session.camera(session.images["sensor_id"].iloc[rows[0]])
-        pose = localize_image(place, session.image_path(int(rows[0])), camera).world_from_rig
+        pose = localize_image(scene_map, session.image_path(int(rows[0])), camera).world_from_rig
         assert ", ".join(repr(float(number)) for number in geometry.qt_from_pose(pose)) in line
 
 
@@ -1240,10 +1240,10 @@ def test_a_picture_has_the_references_of_a_run_with_an_index(small_capture: Path
     run_stage(small_capture, run, query_device="ios")
     of_run = run.retrieval_dir / "settings.json"
     of_run.write_text(json.dumps(json.loads(of_run.read_text()) | {"faiss_gpu": True}))  # where the run was
-    place = Map.open(run.run, run.scene, "ios")
+    scene_map = Map.open(run.run, run.scene, "ios")
     vectors, table = load_embeddings(run.embeddings / "ios_query")
-    found = dict(zip(table["abs_path"], place.retrieve(described([vectors])), strict=True))
-    names = place.localizer.image_names
+    found = dict(zip(table["abs_path"], scene_map.retrieve(described([vectors])), strict=True))
+    names = scene_map.localizer.image_names
     rows = read_references(run.retrieval("ios", "ios"))
     assert len(rows) >= 3
     assert any(len(row["topk"]) < 4 for row in rows), "one cell of two does not hold enough"
@@ -1264,13 +1264,13 @@ def test_a_picture_has_the_references_of_a_run_with_several_descriptors(
     retrieve_pairs(sessions, run.embeddings, run.retrieval_dir, map_device="ios", query_device="ios", queries=LIST)
     assert run.retrieval("ios", "ios").read_text() != alone
     run_stage(small_capture, run, query_device="ios")
-    place = Map.open(run.run, run.scene, "ios")
+    scene_map = Map.open(run.run, run.scene, "ios")
     session = Capture.open(small_capture)["ios_query"]
     folders = (run.embeddings / name / "ios_query" for name in ("thumbnail", "vlad"))
     stored, tables = zip(*map(load_embeddings, folders), strict=True)
-    as_run = place.search.embed_settings
-    answers, localizer = [], place.localizer
-    place.localizer = SimpleNamespace(  # type: ignore[misc, assignment]
+    as_run = scene_map.search.embed_settings
+    answers, localizer = [], scene_map.localizer
+    scene_map.localizer = SimpleNamespace(  # type: ignore[misc, assignment]
         match=lambda query, references: answers.append(references) or localizer.match(query, references),
         solve=localizer.solve,
         image_names=localizer.image_names,
@@ -1282,18 +1282,18 @@ def test_a_picture_has_the_references_of_a_run_with_several_descriptors(
         strict=False,
     ):
         camera = session.camera(session.images["sensor_id"].iloc[of_query[0]])
-        place.search.embed_settings = as_run  # type: ignore[misc]
-        pose = localize_image(place, session.image_path(int(of_query[0])), camera).world_from_rig
+        scene_map.search.embed_settings = as_run  # type: ignore[misc]
+        pose = localize_image(scene_map, session.image_path(int(of_query[0])), camera).world_from_rig
         assert ", ".join(repr(float(number)) for number in geometry.qt_from_pose(pose)) in line
         expected = rows[session.image_name(int(of_query[0]))]
-        names = [place.localizer.image_names[index] for index in answers[-1][0].images]
+        names = [scene_map.localizer.image_names[index] for index in answers[-1][0].images]
         assert names == [image_name(reference["path"]) for reference in expected]
         stated = [reference["score"] for reference in expected]
         np.testing.assert_allclose(answers[-1][0].scores, stated, atol=1e-6)  # a batch of another size
         row = tables[0]["abs_path"].map(image_name).tolist().index(session.image_name(int(of_query[0])))
         # Stored vectors are normalized already, and normalizing once more can change their last bit.
-        place.search.embed_settings = as_run.model_copy(update={"normalize": False})  # type: ignore[misc]
-        (again,) = place.retrieve(described([vectors[row : row + 1] for vectors in stored]))
+        scene_map.search.embed_settings = as_run.model_copy(update={"normalize": False})  # type: ignore[misc]
+        (again,) = scene_map.retrieve(described([vectors[row : row + 1] for vectors in stored]))
         np.testing.assert_array_equal(again.scores, stated)
 
 
@@ -1424,15 +1424,15 @@ def test_no_pose_is_ok_in_a_map_that_contradicts_its_images(
     said = read_map_record(map_record_path(run.poses_dir, run.scene, "ios"))
     assert "OpenGL" in said["text"]
     assert said["text"] in caplog.text
-    place = Map.open(run.run, run.scene, "ios")
+    scene_map = Map.open(run.run, run.scene, "ios")
     right = QueryResult(Status.OK, world_from_rig=np.eye(4))
-    judged = place.finished(Query([], np.eye(4)[None]), right)
+    judged = scene_map.finished(Query([], np.eye(4)[None]), right)
     assert (judged.status, judged.reason[:9]) == (Status.LOW_CONFIDENCE, "the poses")
     assert "OpenGL" in judged.remark
     blamed = QueryResult(Status.LOW_CONFIDENCE, world_from_rig=np.eye(4), reason=NOISE, remark=f"it may be off; {CURE}")
-    assert CURE not in place.finished(Query([], np.eye(4)[None]), blamed).remark  # it would not cure this map
+    assert CURE not in scene_map.finished(Query([], np.eye(4)[None]), blamed).remark  # it would not cure this map
     session = Capture.open(capture)["ios_query"]
-    picture = localize_image(place, session.image_path(0), session.camera(session.images["sensor_id"].iloc[0]))
+    picture = localize_image(scene_map, session.image_path(0), session.camera(session.images["sensor_id"].iloc[0]))
     assert picture.status != "ok"
 
 
@@ -1490,23 +1490,23 @@ def test_a_picture_is_localized_near_a_rough_pose(
     small_capture: Path, finished: tuple[SceneFiles, pd.DataFrame]
 ) -> None:
     files, _ = finished
-    place = Map.open(files.run, files.scene, "ios")
+    scene_map = Map.open(files.run, files.scene, "ios")
     session = Capture.open(small_capture)["ios_query"]
     path, camera = session.image_path(0), session.camera(session.images["sensor_id"][0])
-    found = localize_image(place, path, camera).world_from_rig
+    found = localize_image(scene_map, path, camera).world_from_rig
     assert found is not None
-    estimate = localize_image(place, path, camera, near=RoughPose(found, 1.0, 0.05))
+    estimate = localize_image(scene_map, path, camera, near=RoughPose(found, 1.0, 0.05))
     assert estimate.status == "ok"
     assert geometry.pose_error(np.asarray(estimate.world_from_rig), found)[1] < 0.01
-    rows = [place.session.row_of_name[name] for name in place.localizer.image_names]
-    mapped = place.session.world_from_cam(np.array(rows))
+    rows = [scene_map.session.row_of_name[name] for name in scene_map.localizer.image_names]
+    mapped = scene_map.session.world_from_cam(np.array(rows))
     vectors, _ = load_embeddings(files.embeddings / "ios_map")
     for about in mapped:  # whatever the picture looks like
-        (references,) = place.retrieve(described([vectors[:1]]), near=RoughPose(about, 1.0, 0.05))
+        (references,) = scene_map.retrieve(described([vectors[:1]]), near=RoughPose(about, 1.0, 0.05))
         angles = np.degrees(np.arccos(np.clip(mapped[:, :3, 2] @ about[:3, 2], -1, 1)))
         assert sorted(references.images) == np.flatnonzero(angles < 63.0).tolist()
     away = geometry.make_pose(found[:3, :3], [1e6, 0.0, 0.0])
-    nowhere = localize_image(place, path, camera, near=RoughPose(away, 1.0, 0.05))
+    nowhere = localize_image(scene_map, path, camera, near=RoughPose(away, 1.0, 0.05))
     assert nowhere.status == "ok"  # no image of the map is there: all are searched
 
 
@@ -1515,9 +1515,9 @@ def test_further_features_know_the_images_of_every_kind(opened: Map) -> None:
     none = all_.map.part(np.zeros(0, np.int64))
     rest: dict[str, Any] = {name: getattr(none, name)[1:] for name in ("image_names", "cameras", "world_from_cams")}
     further: Any = SimpleNamespace(name="aliked")
-    place = replace(opened, mapped=[MappedFeatures(replace(none, **rest), {}), all_], escalation=[further])
-    assert place.fallback is not None
-    assert place.fallback.image_names == place.localizer.image_names == [*rest["image_names"], first]
+    scene_map = replace(opened, mapped=[MappedFeatures(replace(none, **rest), {}), all_], escalation=[further])
+    assert scene_map.fallback is not None
+    assert scene_map.fallback.image_names == scene_map.localizer.image_names == [*rest["image_names"], first]
 
 
 @pytest.mark.parametrize(("length", "radius_deg"), [(1.0, 1.0), (0.1, 3.8183), (0.01, 6.0)])
@@ -1526,13 +1526,13 @@ def test_a_rough_pose_is_as_rough_as_the_map_is_small(
 ) -> None:
     """1 cm at a depth of 3 m, 0.3 m and 3 cm; two standard deviations, from 1 to 6 degrees."""
     mapped = opened.mapped[0]
-    place = replace(opened, mapped=[MappedFeatures(replace(mapped.map, length=length), mapped.features)])
+    scene_map = replace(opened, mapped=[MappedFeatures(replace(mapped.map, length=length), mapped.features)])
     priors: list[Prior] = []
-    localizer = AsManyAsFeatures(place.mapped)
+    localizer = AsManyAsFeatures(scene_map.mapped)
     localizer.solve = lambda *asked: priors.extend(asked[2]) or QueryResult(Status.OK)  # type: ignore[method-assign]
-    vars(place)["localizer"] = localizer
+    vars(scene_map)["localizer"] = localizer
     camera = pycolmap.Camera(model="PINHOLE", width=10, height=20, params=[10, 10, 5, 10])
-    localize_image(place, np.zeros((20, 10), np.uint8), camera, near=RoughPose(np.eye(4), 0.0, 0.01))
+    localize_image(scene_map, np.zeros((20, 10), np.uint8), camera, near=RoughPose(np.eye(4), 0.0, 0.01))
     assert [prior.radius_deg for prior in priors] == [pytest.approx(radius_deg, abs=1e-4)]
 
 
@@ -1541,14 +1541,14 @@ def test_a_picture_is_not_compared_with_vectors_of_another_vocabulary(
 ) -> None:
     files = SceneFiles(tmp_path / "run", finished[0].scene)
     copy_shared(finished[0].root, files.root)
-    place, session = Map.open(files.run, files.scene, "ios"), Capture.open(capture)["ios_query"]
+    scene_map, session = Map.open(files.run, files.scene, "ios"), Capture.open(capture)["ios_query"]
     path, camera = session.image_path(0), session.camera(session.images["sensor_id"][0])
     with np.load(files.embeddings / "vlad.npz") as stored:
         arrays = dict(stored)
     np.savez(files.embeddings / "vlad.npz", **arrays | {"centroids": 2 * arrays["centroids"]})
     sidecar_path(files.embeddings / "vlad.npz").unlink()
     with pytest.raises(ArtifactError, match=r"embeddings/ios_map/.*\.npy was made by another .*vocabulary"):
-        localize_image(place, path, camera)
+        localize_image(scene_map, path, camera)
 
 
 def test_a_query_that_failed_is_localized_again_where_odometry_leads(
@@ -1614,13 +1614,13 @@ def test_a_query_is_localized_again_as_upright_as_the_networks_of_the_run_saw_it
     small_capture: Path, finished: tuple[SceneFiles, pd.DataFrame], monkeypatch: pytest.MonkeyPatch, network: str
 ) -> None:
     files, session = finished[0], Capture.open(small_capture)["hl_query"]
-    place = replace(Map.open(files.run, files.scene, "ios"), escalation=[])
+    scene_map = replace(Map.open(files.run, files.scene, "ios"), escalation=[])
     if network == "embedder":
-        vars(place.search)["embedders"] = [Learned(np.zeros(1, np.float32))]
+        vars(scene_map.search)["embedders"] = [Learned(np.zeros(1, np.float32))]
     if network == "reranker":
-        place.reranked = True
-        vars(place.search)["_verification"] = LocalMethod("superpoint", Mock(), Mock()), Mock()
-    monkeypatch.setattr(Map, "open", lambda *_: place)
+        scene_map.reranked = True
+        vars(scene_map.search)["_verification"] = LocalMethod("superpoint", Mock(), Mock()), Mock()
+    monkeypatch.setattr(Map, "open", lambda *_: scene_map)
     shown: list[Any] = []
     monkeypatch.setattr(
         Map,

@@ -3,6 +3,7 @@
 import ast
 import shutil
 import subprocess
+from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -100,6 +101,15 @@ def test_no_module_imports_itself_through_others() -> None:
 def test_the_top_level_is_a_table_of_contents() -> None:
     files = {path.stem for path in TOOLKIT.glob("*.py")} - {"__init__"}
     assert files == {"__main__", "pipeline", "notebook", *STAGES, "geometry", "files", "threads", "errors"}
+
+
+def test_no_room_is_large() -> None:
+    """At most 12 % of the lines each, so that a newcomer can read the one that a change is in."""
+    lines = Counter[str]()
+    for path in MODULES.values():
+        lines[path.relative_to(TOOLKIT).parts[0]] += len(path.read_text(encoding="utf-8").splitlines())
+    shares = {name: count / lines.total() for name, count in lines.items()}
+    assert {name: f"{share:.1%}" for name, share in shares.items() if share > 0.12} == {}
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="needs make")

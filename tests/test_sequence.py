@@ -26,7 +26,7 @@ from toolkit.sequence import COLUMNS, sequence_pairs
 from toolkit.sequences.pose_graph import FAR
 from toolkit.synthetic import capture as rendering
 from toolkit.synthetic import render_capture
-from toolkit.synthetic.capture import DEVICES, PICTURE_S, RATE_HZ, tracked
+from toolkit.synthetic.capture import DEVICES, IMAGE_PERIOD_S, RATE_HZ, tracked
 from toolkit.synthetic.render import Scene, build_room
 
 pytest.importorskip("gtsam")
@@ -280,7 +280,7 @@ class Alike:
         for recording in self.session.subsessions:
             own = np.flatnonzero([id_.startswith(f"{recording}/") for id_ in truth.device_ids])
             kept, poses = tracked(
-                rng, truth.timestamps[own], truth.world_from_device[own], 1.0, PICTURE_S * RATE_HZ, losses, gaps
+                rng, truth.timestamps[own], truth.world_from_device[own], 1.0, IMAGE_PERIOD_S * RATE_HZ, losses, gaps
             )
             rows.append(own[kept])
             measured.append(poses[kept])

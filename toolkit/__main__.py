@@ -190,18 +190,18 @@ def localize(
         given = None if camera is None else parse_camera("camera", camera)
     except ValueError as error:
         raise CameraError(f"camera: {error}") from None
-    place = FinishedRun.open(run).map(device, scene)
+    scene_map = FinishedRun.open(run).map(device, scene)
     origin = None
     with suppress(CaptureError):
-        origin = origin_of(place.session)
+        origin = origin_of(scene_map.session)
     rows: list[dict[str, Any]] = []
     poses: list[Any] = []
-    for path, result in zip(photographs, localize_images(place, photographs, given), strict=True):
+    for path, result in zip(photographs, localize_images(scene_map, photographs, given), strict=True):
         row: dict[str, Any] = {"image": str(path), "status": result.status_text, "world_from_cam": None}
         row |= {"inliers": result.num_inliers, "remark": result.remark}
         if result.world_from_rig is not None:
             poses.append(result.world_from_rig)
-            unknown = {} if place.settings.unit else {"unit": "unknown"}  # as in a table of poses
+            unknown = {} if scene_map.settings.unit else {"unit": "unknown"}  # as in a table of poses
             row |= {"world_from_cam": result.world_from_rig.tolist(), **unknown}
             row["position_std" if unknown else "position_std_m"] = result.position_std
             if origin is not None:
@@ -221,11 +221,11 @@ def localize(
         from toolkit.figures.top_view import draw_scene
         from toolkit.results.localized import sure_points
 
-        cloud = sure_points(place.mapped[0].map if place.mapped else None)
+        cloud = sure_points(scene_map.mapped[0].map if scene_map.mapped else None)
         found = np.array(poses).reshape(-1, 4, 4)
         title = f"Photographs in the map, from above: {len(poses)} of {len(rows)} have a pose"
-        unit = ("m" if place.capture.unit else "unknown unit", 1.0)
-        cameras = place.session.world_from_cam()
+        unit = ("m" if scene_map.capture.unit else "unknown unit", 1.0)
+        cameras = scene_map.session.world_from_cam()
         draw_scene(*cloud, cameras, found, np.full_like(found, np.nan), title=title, unit=unit).savefig(picture)
         print(f"Picture: {picture}", file=sys.stderr if as_json else sys.stdout)
     if as_json:

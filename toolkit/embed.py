@@ -37,7 +37,7 @@ from toolkit.files import (
 from toolkit.geometry import Ints, unit
 from toolkit.manifest import EmbedSettings
 from toolkit.models.weights import resolve_weights
-from toolkit.store.items import Items, heals, items_beside, remove_items
+from toolkit.store.items import Items, items_beside, remove_items, retry_damaged
 from toolkit.threads import one_thread
 
 log = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ VOCABULARY_IMAGES = 2048
 """Map images from which the vocabulary is learned, at most, spread evenly: bounds time and memory."""
 
 
-@heals
+@retry_damaged
 def embed_sessions(
     sessions_root: str | Path,
     out_dir: str | Path,
@@ -177,8 +177,8 @@ class _Model:
                 todo = [(f"{at:08d}", source, at) for at in range(-(-len(part.rows) // settings.batch_size))]
                 store = store_of(part.session.id) if embedder.inputs == "features" else None
                 arguments = embedder, part, settings, store
-                with Items(items_beside(matrix_path), again=not self.skip_existing) as batches:
-                    left = batches.spread(_embed_into, batches.left(todo), arguments, _label(part), "batch")
+                with Items(items_beside(matrix_path), skip_existing=self.skip_existing) as batches:
+                    left = batches.distribute(_embed_into, batches.left(todo), arguments, _label(part), "batch")
                     _embed_into(batches, left, *arguments)
                     batches.flush()
                     failed = {row: reason for name, *_ in todo for row, reason in batches.note(name)["failed"]}
@@ -334,7 +334,7 @@ def _embed_into(
                 return row, store.failed.get(name, "no local features were extracted")
             return row, embedder.prepare(store[name])
         try:
-            image = read_image(session.image_path(row), least_side=embedder.least_side)
+            image = read_image(session.image_path(row), min_side=embedder.min_side)
         except ImageError as error:
             return row, str(error)
         return row, embedder.prepare(turn_image(image, int(part.turns[at])))

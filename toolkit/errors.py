@@ -71,7 +71,7 @@ class ArtifactError(ToolkitError):
 
 
 class DamagedError(ArtifactError):
-    """Items of a file differ from what was written; see `store.items.heals`."""
+    """Items of a file differ from what was written; see `store.items.retry_damaged`."""
 
     def __init__(self, path: Path, message: str) -> None:
         super().__init__(message)
@@ -86,7 +86,7 @@ class ImageError(ToolkitError):
 
 
 class CameraError(ImageError):
-    """A camera, or a camera's pose or turn, is invalid or does not fit the pictures."""
+    """A camera, or a camera's pose or turn, is invalid or does not fit the images."""
 
 
 class WeightsError(ToolkitError):

@@ -109,7 +109,7 @@ def evaluate_scene(
     errors, messages, sources, truths = list[pd.DataFrame](), list[str](), list[Path](), list[Path]()
     references_dir = retrieval_dir and (reranked_dir or retrieval_dir)
     for query in devices[1]:
-        maps = [map_ for map_, _ in _chosen((devices[0], [query]), pairs)]
+        maps = [mapped for mapped, _ in _chosen((devices[0], [query]), pairs)]
         if not maps:
             continue
         reason = ""
@@ -117,14 +117,14 @@ def evaluate_scene(
             session = capture[f"{query}_query"]
             truths += filter(Path.is_file, [session.path / ALIGNED])
             keys, truth = _queries_with_truth(session, queries, messages)
-            tables = (_table_of(poses_dir, capture.name, map_, query) for map_ in maps)
+            tables = (_table_of(poses_dir, capture.name, mapped, query) for mapped in maps)
             messages += metrics.camera_messages(session, [table for table in tables if table is not None])
         except CaptureError as error:
             reason = str(error)
-        for map_ in maps:
-            pair, name = {"map_device": map_, "query_device": query}, pair_name(capture.name, map_, query)
+        for mapped in maps:
+            pair, name = {"map_device": mapped, "query_device": query}, pair_name(capture.name, mapped, query)
             poses = Path(poses_dir) / f"{name}.txt"
-            if cause := reason or left_out(poses_dir, name) or _unreadable(capture, f"{map_}_map"):
+            if cause := reason or left_out(poses_dir, name) or _unreadable(capture, f"{mapped}_map"):
                 messages.append(f"{name} was left out: {cause}")
                 for kind in ("recall", "losses"):
                     rows[kind].append({**pair, "state": f"{LEFT_OUT}{cause}"})
@@ -134,7 +134,7 @@ def evaluate_scene(
                 for kind in rows:
                     rows[kind].append({**pair, "state": "no queries" if no_queries else "no ground truth"})
                 continue
-            record = read_map_record(map_record_path(poses_dir, capture.name, map_))
+            record = read_map_record(map_record_path(poses_dir, capture.name, mapped))
             unit, length = metrics.length_unit(record)
             read = [poses, poses.with_suffix(".csv"), poses.with_name(f"{name}_sequence.txt")]
             read += [Path(folder) / f"{name}.jsonl" for folder in (retrieval_dir, reranked_dir) if folder is not None]
@@ -146,7 +146,7 @@ def evaluate_scene(
             elif references_dir is not None:
                 lengths = length, record["length"] or length
                 path = Path(references_dir) / f"{name}.jsonl"
-                row, good = _retrieval_recall(path, keys, truth, capture[f"{map_}_map"], unit, *lengths)
+                row, good = _retrieval_recall(path, keys, truth, capture[f"{mapped}_map"], unit, *lengths)
                 rows["retrieval"].append({**pair, **row})
                 if good is None:
                     messages.append(f"{name}: {row['state']}, so no miss is attributed to retrieval.")
@@ -217,19 +217,19 @@ def evaluate_sequences(
     """
     steps, changes = [pd.DataFrame()], [pd.DataFrame()]
     warn_of_older(poses_dir)
-    for map_, query in _chosen((map_devices, query_devices), pairs):
-        sequence = SequencePair.find(poses_dir, capture.name, map_, query)
+    for mapped, query in _chosen((map_devices, query_devices), pairs):
+        sequence = SequencePair.find(poses_dir, capture.name, mapped, query)
         if sequence is None:
             continue
         try:
             keys, truth = _queries_with_truth(capture[f"{query}_query"], queries, [])
             if truth is None or not len(keys):
                 continue
-            unit, length = metrics.length_unit(read_map_record(map_record_path(poses_dir, capture.name, map_)))
-            pair = {"map_device": map_, "query_device": query}
+            unit, length = metrics.length_unit(read_map_record(map_record_path(poses_dir, capture.name, mapped)))
+            pair = {"map_device": mapped, "query_device": query}
             steps.append(pd.DataFrame(sequence.recalls(keys, truth, limits, unit, length)).assign(**pair))
             changed = metrics.named_by_unit(sequence.changes(keys, truth, limits[-1], length).assign(**pair), unit)
-            single = PairResults.of(poses_dir, capture.name, map_, query).table
+            single = PairResults.of(poses_dir, capture.name, mapped, query).table
             # Results of earlier versions have no names of images.
             images = single.reindex(columns=[*(key := ["timestamp", "device_id"]), "image"], fill_value="")
             changes.append(changed.merge(images, "left", on=key))
@@ -417,7 +417,7 @@ def _retrieval_recall(
 ) -> tuple[dict[str, Any], NDArray[np.bool_] | None]:
     """Return a pair's row of the table `retrieval`, and whether each query has a good reference (None if unreadable).
 
-    `length` is the table's unit of lengths, and `map_length` is `Survey.length`, in the unit of the poses: far scenes
+    `length` is the table's unit of lengths, and `map_length` is `LocalMap.length`, in the unit of the poses: far scenes
     show the same from further apart.
     """
     if not path.is_file():
@@ -499,23 +499,23 @@ def overlap_table(
     """
     capture, load, rows = Capture.from_sessions_root(sessions_root), lru_cache(maxsize=1)(load_maps), []
     devices = capture.devices_with("map", map_device), capture.devices_with("query", query_device)
-    for map_, query in _chosen(devices, pairs) if references else ():
-        name = pair_name(capture.name, map_, query)
+    for mapped, query in _chosen(devices, pairs) if references else ():
+        name = pair_name(capture.name, mapped, query)
         h5 = None if poses_dir is None else Path(poses_dir) / f"{name}.h5"
-        row: dict[str, Any] = {"map_device": map_, "query_device": query, "state": "evaluated"}
+        row: dict[str, Any] = {"map_device": mapped, "query_device": query, "state": "evaluated"}
         rows.append(row)
         # Files of a pair that was left out are those of an earlier run.
-        causes = [_unreadable(capture, f"{query}_query") or _unreadable(capture, f"{map_}_map")]
+        causes = [_unreadable(capture, f"{query}_query") or _unreadable(capture, f"{mapped}_map")]
         causes += [left_out(folder, name) for folder in references.values()]
         if h5 is not None:
             causes.append(why_older(h5.with_suffix(".txt"), "localize", (".npz",), missing=False))
         if cause := next(filter(None, causes), ""):
             row["state"] = f"{LEFT_OUT}{cause}"
             continue
-        local_map = load(map_files(map_dir, f"{map_}_map", h5))
+        local_map = load(map_files(map_dir, f"{mapped}_map", h5))
         for column, folder in references.items():
             path = Path(folder) / f"{name}.jsonl"
-            row |= _overlap(path, column, capture[f"{query}_query"], capture[f"{map_}_map"], local_map)
+            row |= _overlap(path, column, capture[f"{query}_query"], capture[f"{mapped}_map"], local_map)
     return _table(pd.DataFrame(rows), "images", "points")
 
 

@@ -60,7 +60,7 @@ from toolkit.scene.images import localize_image
 from toolkit.scene.map import FEW_REFERENCES, WITHOUT_FEATURES, Map
 from toolkit.scene.run import StoredQueries
 from toolkit.store.hdf5 import write_groups
-from toolkit.store.items import Items, heals
+from toolkit.store.items import Items, retry_damaged
 from toolkit.threads import fixed_sums
 
 __all__ = ["COLUMNS", "PREDICTION_COLUMNS", "Map", "explain_query", "localize_image", "localize_pairs"]
@@ -80,7 +80,7 @@ FALLBACK_COLUMNS = ["first_status", "first_seconds"]
 empty for a query that did not need them."""
 
 
-@heals
+@retry_damaged
 def localize_pairs(
     sessions_root: str | Path,
     retrieval_dir: str | Path,
@@ -393,10 +393,10 @@ class _Pair:
         """
         names, source = [query_group(*key) for key in self.keys], fingerprint(record)
         numbers = {name: number for number, name in enumerate(names)}  # a keyframe list may repeat a query
-        with Items(self.file("items"), again=not self.stage.skip_existing) as items:
+        with Items(self.file("items"), skip_existing=self.stage.skip_existing) as items:
             items.drop_damaged()
             todo = items.left((name, source, number) for name, number in numbers.items())
-            faulty = self._spread(items, todo)
+            faulty = self._distribute(items, todo)
             if self.map.fallback is not None:
                 for end in (_FEW, _RETRIED):
                     items.flush()
@@ -407,7 +407,7 @@ class _Pair:
                     if todo:
                         started = time.perf_counter()
                         self.add_fallback(items, todo)
-                        faulty |= self._spread(items, todo, (time.perf_counter() - started) / len(todo))
+                        faulty |= self._distribute(items, todo, (time.perf_counter() - started) / len(todo))
         # If the run is killed before it writes the new poses, no poses of an earlier run may lie beside this file.
         for poses in (self.file("txt"), sidecar_path(self.file("txt"))):
             poses.unlink(missing_ok=True)
@@ -427,10 +427,10 @@ class _Pair:
         images = self.session.own_names(self.rows)
         return [rows[name] | {"image": image} for name, image in zip(names, images, strict=True)], bool(faulty)
 
-    def _spread(self, items: Items, todo: Sequence[_Todo], *retry_s: float) -> dict[int, QueryResult]:
+    def _distribute(self, items: Items, todo: Sequence[_Todo], *retry_s: float) -> dict[int, QueryResult]:
         """Localize queries, with the workers of the cluster if there is one; see `localize_into`."""
         arguments, size = (self.stage.of_worker, *self.devices, *retry_s), self.map.localizer.batch_size
-        todo = items.spread(_do_share, todo, arguments, self.label, "query", 1 if retry_s else size)
+        todo = items.distribute(_do_share, todo, arguments, self.label, "query", 1 if retry_s else size)
         return self.localize_into(items, todo, *retry_s)
 
     def _stored(self, items: Items, todo: _Todo) -> tuple[QueryResult, QueryResult]:

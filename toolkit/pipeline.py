@@ -99,7 +99,7 @@ log = logging.getLogger(__name__)
 MAP = "map"
 """In place of a stage: build the maps for queries to come."""
 _FOR_MAP = ("embed", "retrieve", "localize")
-MOST_WARNINGS = 5
+MAX_WARNINGS = 5
 """Limit of warnings per stage on the terminal; `run.log` has all of them."""
 
 
@@ -634,10 +634,10 @@ def _run_job(job: Job, inputs: str, head: str, record: RunLog, say: Say, kernels
         say(f"  left out: {one['what']}: {one['reason']}")
     warnings = [one for one in warnings_of_kernels(job.files.run / LOG, logged) if one not in record.shown]
     record.shown.update(warnings)
-    for one in warnings[:MOST_WARNINGS]:
+    for one in warnings[:MAX_WARNINGS]:
         say(f"  warning: {one}")
-    if len(warnings) > MOST_WARNINGS:
-        say(f"  ... and {len(warnings) - MOST_WARNINGS} more warnings, see {job.files.run / LOG}")
+    if len(warnings) > MAX_WARNINGS:
+        say(f"  ... and {len(warnings) - MAX_WARNINGS} more warnings, see {job.files.run / LOG}")
     return row
 
 

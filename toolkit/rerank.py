@@ -37,13 +37,13 @@ from toolkit.files import (
 from toolkit.geometry import Ints
 from toolkit.manifest import RerankSettings
 from toolkit.runs.pairs import PairRows
-from toolkit.store.items import Items, heals, items_beside, remove_items
+from toolkit.store.items import Items, items_beside, remove_items, retry_damaged
 from toolkit.threads import one_thread
 
 log = logging.getLogger(__name__)
 
 
-@heals
+@retry_damaged
 def rerank_pairs(
     sessions_root: str | Path,
     retrieval_dir: str | Path,
@@ -162,7 +162,7 @@ class _Pair:
                 return index, self._row(queries[index], reason_of(error, f"reranking {queries[index]['path']}"))
 
         source = fingerprint(self.record)
-        with Items(items_beside(self.path), again=not skip_existing) as progress:
+        with Items(items_beside(self.path), skip_existing=skip_existing) as progress:
             todo = [int(name) for name, _ in progress.left((str(index), source) for index in range(len(queries)))]
             # Queries with the same first reference run one after another, so that it is read once.
             todo.sort(key=lambda index: _name(queries[index]["topk"][0]) if queries[index]["topk"] else "")

@@ -126,7 +126,7 @@ def retrieve_pairs(
                 }
                 masks, without = _masks(settings, poses, database, query)
                 skipped = skip_existing and is_current(path, record)
-                # Single photographs that are localized later search the map's index, too.
+                # Single images that are localized later search the map's index, too.
                 skipped = skipped and is_index_current(embeddings, database.session.id, database.vectors, settings)
                 if not skipped:
                     _require_same_dimension(query, database)
@@ -137,7 +137,7 @@ def retrieve_pairs(
             continue
         found: dict[str, Found] = {}
         started = time.perf_counter()
-        find = partial(_search, database=database, settings=settings, embeddings=embeddings, again=not skip_existing)
+        find = partial(_search, database=database, settings=settings, embeddings=embeddings, rebuild=not skip_existing)
         with suppress(ArtifactError):  # a value is not finite: search pair by pair, so that only its row fails
             found = find({device: query for device, (query, _, _) in todo.items()})
         shared = (time.perf_counter() - started) / len(todo)
@@ -241,14 +241,14 @@ def _require_same_dimension(query: _Images, database: _Images) -> None:
 
 
 def _search(
-    queries: Mapping[str, _Images], database: _Images, settings: RetrieveSettings, embeddings: Path, again: bool
+    queries: Mapping[str, _Images], database: _Images, settings: RetrieveSettings, embeddings: Path, rebuild: bool
 ) -> dict[str, Found]:
     """Return the best map images of several sets of queries, with one pass over the map; all values must be finite."""
     stacked = Vectors.stack([query.vectors for query in queries.values()])
     backend: Backend = "faiss" if settings.use_faiss else "torch"
     masks = [query.masks for query in queries.values() if query.masks is not None]
     try:
-        index = make_index(embeddings, database.session.id, database.vectors, settings, not again)
+        index = make_index(embeddings, database.session.id, database.vectors, settings, not rebuild)
         found = search(
             stacked, database.vectors, settings.topk, backend, settings.compute_device, settings.faiss_gpu, index,
             Masks.stack(masks) if masks else None, database.vectors.dims,

@@ -152,15 +152,15 @@ def _place_pair(
         record["localize"] = read_sidecar(poses)
     skipped = skip_existing and is_current(out, record)
     if not skipped:
-        again = _Relocalizer(poses_dir, capture.name, map_device, session) if settings.relocalize else None
-        frames, steps, trajectory = _frames(session, _SingleQueries.of(PairResults.open(poses)), settings, again)
+        relocalizer = _Relocalizer(poses_dir, capture.name, map_device, session) if settings.relocalize else None
+        frames, steps, trajectory = _frames(session, _SingleQueries.of(PairResults.open(poses)), settings, relocalizer)
         unit = read_map_record(map_record_path(poses_dir, capture.name, map_device))["unit"]
         csvs = {out.with_suffix(".csv"): in_unit_of_poses(frames, unit), out.with_name(f"{out.stem}_steps.csv"): steps}
         for path, rows in csvs.items():
             with write_atomic(path) as temporary:
                 rows.to_csv(temporary, index=False)
         trajectory.write(out)
-        write_sidecar(out, record, list(csvs), made_from=inputs, unfinished=again is not None and again.met_a_bug)
+        write_sidecar(out, record, list(csvs), made_from=inputs, unfinished=bool(relocalizer and relocalizer.met_a_bug))
     frames = pd.read_csv(out.with_suffix(".csv"), keep_default_na=False)
     return {
         "frames": len(frames),
@@ -296,15 +296,15 @@ def _frames(
         motion, queries, frames = piece.motion, piece.posed, piece.posed.frames
         with_odometry[piece.query[piece.query_frames]] = True
         keys = pd.DataFrame({"timestamp": motion.timestamps, "device_id": piece.device_ids})
-        again = None if relocalizer is None else partial(relocalizer, keys)
-        done = localize_piece(motion, queries, piece.query_frames, settings, again)
+        relocalize = None if relocalizer is None else partial(relocalizer, keys)
+        done = localize_piece(motion, queries, piece.query_frames, settings, relocalize)
         placed = done.placed
         steps += _step_rows(piece, done.steps)
         table = keys.reindex(columns=list(COLUMNS)).astype(object)
         table["recording"], table["piece"], table["status"] = piece.recording, numbers[piece.recording], placed.status
         numbers[piece.recording] += 1
         table["single_status"] = np.append(singles.status, "")[piece.query]
-        table.loc[list(done.again), "again_status"] = [result.status_text for result in done.again.values()]
+        table.loc[list(done.relocalized), "again_status"] = [each.status_text for each in done.relocalized.values()]
         turned, moved = pose_error(placed.world_from_rig[frames], queries.world_from_rig)
         for name, values in (("moved_m", moved.round(6)), ("turned_deg", turned.round(6))):
             table.loc[frames, name] = values

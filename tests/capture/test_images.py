@@ -124,37 +124,37 @@ def test_half_an_image_is_refused(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("least_side", "size"),
+    ("min_side", "size"),
     [(None, (896, 672)), (337, (896, 672)), (336, (448, 336)), (168, (224, 168)), (84, (112, 84)), (1, (112, 84))],
 )
-def test_photographs_are_decoded_smaller(tmp_path: Path, least_side: int | None, size: tuple[int, int]) -> None:
-    """JPEG by 2, 4 and 8, as long as the shorter side has `least_side` pixels; nothing moves."""
+def test_photographs_are_decoded_smaller(tmp_path: Path, min_side: int | None, size: tuple[int, int]) -> None:
+    """JPEG by 2, 4 and 8, as long as the shorter side has `min_side` pixels; nothing moves."""
     x, y = np.meshgrid(np.linspace(0, 1, 896), np.linspace(0, 1, 672))
     smooth = np.stack([255 * x, 255 * y, 127 * (1 + np.sin(6 * x + 9 * y))], axis=-1).astype(np.uint8)
     path = tmp_path / "a.jpg"
     Image.fromarray(smooth).save(path, quality=98)
-    image = read_image(path, least_side=least_side)
+    image = read_image(path, min_side=min_side)
     assert image.shape == (size[1], size[0], 3)
     shown, whole = (np.asarray(Image.fromarray(one).resize((42, 42)), int) for one in (image, smooth))
     assert np.abs(shown - whole).max() <= 3
-    if least_side:
-        assert read_image(path, gray=True, least_side=least_side).shape == (672, 896)
+    if min_side:
+        assert read_image(path, gray=True, min_side=min_side).shape == (672, 896)
         Image.fromarray(smooth).save(tmp_path / "a.png")
-        np.testing.assert_array_equal(read_image(tmp_path / "a.png", least_side=least_side), smooth)
+        np.testing.assert_array_equal(read_image(tmp_path / "a.png", min_side=min_side), smooth)
 
 
 @pytest.mark.parametrize(("size", "by"), [((900, 700), 4), ((900, 702), 2), ((899, 700), 1), ((896, 701), 1)])
 def test_only_a_whole_number_of_pixels_is_left_out(tmp_path: Path, size: tuple[int, int], by: int) -> None:
     """Else the last column would stand for fewer, and all be moved: MegaLoc then loses up to 0.0025 of the cosine."""
     Image.new("RGB", size).save(tmp_path / "a.jpg")
-    assert read_image(tmp_path / "a.jpg", least_side=80).shape == (size[1] // by, size[0] // by, 3)
+    assert read_image(tmp_path / "a.jpg", min_side=80).shape == (size[1] // by, size[0] // by, 3)
 
 
 def test_half_a_photograph_is_refused_at_any_size(tmp_path: Path) -> None:
     path = tmp_path / "a.jpg"
     path.write_bytes(noise_file(path)[: path.stat().st_size // 2])
     with pytest.raises(ImageError, match="cannot be decoded"):
-        read_image(path, least_side=50)
+        read_image(path, min_side=50)
 
 
 @pytest.mark.parametrize(

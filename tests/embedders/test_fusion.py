@@ -26,7 +26,7 @@ DIMS = (6, 9)
 class Thumbnail:
     """A small descriptor of somebody's own: the colors of an image in 3 x 4 cells."""
 
-    name, inputs, upright, least_side, dim = "thumbnail", "images", False, None, 36
+    name, inputs, upright, min_side, dim = "thumbnail", "images", False, None, 36
     settings = {"name": "thumbnail"}  # noqa: RUF012
 
     def __init__(self, **_: object) -> None:

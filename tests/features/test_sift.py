@@ -319,7 +319,7 @@ def test_the_memory_of_the_last_image_does_not_show_in_the_next() -> None:
 
 def test_a_large_image_does_not_stay_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     expected = SiftExtractor().extract([textured(3)])[0]
-    monkeypatch.setattr(sift, "_MOST_KEPT", 10_000)
+    monkeypatch.setattr(sift, "_MAX_KEPT", 10_000)
     extractor = SiftExtractor()
     assert_same(extractor.extract([textured(3)])[0], expected)
     assert len(extractor._memory.values) == 0

@@ -17,8 +17,8 @@ from toolkit.features.stores import FeatureStore
 from toolkit.geometry import Floats
 from toolkit.mapping.build import build_map, instants
 from toolkit.mapping.local_map import Consistency, LocalMap
-from toolkit.mapping.pose_consistency import Survey, SurveyedImages
-from toolkit.mapping.pose_noise import SurveyedPairs, _changed
+from toolkit.mapping.pose_consistency import MapImages, PoseConsistency
+from toolkit.mapping.pose_noise import PosedPairs, _changed
 
 Change = Callable[[Floats], Floats]
 OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -66,10 +66,10 @@ def upright_otherwise(poses: Floats) -> Floats:
     return world @ poses
 
 
-def survey_of(
+def checked(
     capture: Path, features: Path, device: str, change: Change, count: int | None = None, scale: float = 1
-) -> Survey:
-    """Return the survey of the first images of a map whose poses were changed, and the offsets of its rigs scaled."""
+) -> PoseConsistency:
+    """Return the check of the first images of a map whose poses were changed, and the offsets of its rigs scaled."""
     session = Capture.open(capture)[f"{device}_map"]
     store = FeatureStore.of_session(features, session.id, SiftExtractor().settings)
     rows = np.arange(len(session.images))[:count]
@@ -78,7 +78,7 @@ def survey_of(
     if scale != 1:
         rig_from_cams = scaled(scale)(rig_from_cams)
     names, sensors = [session.image_name(int(row)) for row in rows], session.images["sensor_id"].tolist()[:count]
-    images = SurveyedImages(
+    images = MapImages(
         names,
         [session.camera(sensor) for sensor in sensors],
         poses,
@@ -86,14 +86,14 @@ def survey_of(
         instants(session, rows),
         sensors,
     )
-    return Survey(images, lambda index: store[names[index]], KINDS["sift"])
+    return PoseConsistency(images, lambda index: store[names[index]], KINDS["sift"])
 
 
-def consistency_of(survey: Survey) -> Consistency:
+def consistency_of(check: PoseConsistency) -> Consistency:
     """Return the verdict over a map without points, in which every image has an equal part."""
-    images, none = survey.images, np.zeros(0, np.int64)
+    images, none = check.images, np.zeros(0, np.int64)
     empty = np.zeros((0, 3))
-    return survey.consistency(
+    return check.judge(
         LocalMap(
             list(images.names), list(images.cameras), images.world_from_cams, empty, empty.astype(np.uint8),
             none, none, none, np.zeros(0, np.float32),
@@ -108,7 +108,7 @@ def consistency_of(survey: Survey) -> Consistency:
 def test_right_poses_are_consistent(
     small_capture: Path, small_features: Path, device: str, change: Change, scale: float
 ) -> None:
-    found = consistency_of(survey_of(small_capture, small_features, device, change, scale=scale))
+    found = consistency_of(checked(small_capture, small_features, device, change, scale=scale))
     assert found.verdict == "consistent"
     assert found.agreeing > 0.9 * found.pairs
     assert not found.text
@@ -133,7 +133,7 @@ def test_the_noise_of_the_poses_is_measured(
     small_capture: Path, small_features: Path, rotation_deg: float, position_m: float
 ) -> None:
     found = [
-        consistency_of(survey_of(small_capture, small_features, device, noisy(rotation_deg, position_m, seed)))
+        consistency_of(checked(small_capture, small_features, device, noisy(rotation_deg, position_m, seed)))
         for device in ("hl", "spot")
         for seed in (1, 2, 3)
     ]
@@ -148,7 +148,7 @@ def test_the_noise_of_the_poses_is_measured(
 
 def test_exact_poses_have_no_noise(small_capture: Path, small_features: Path) -> None:
     for device in ("ios", "hl", "spot"):
-        found = consistency_of(survey_of(small_capture, small_features, device, np.array))
+        found = consistency_of(checked(small_capture, small_features, device, np.array))
         assert (found.rotation_noise_deg, found.position_noise, found.direction_noise_deg) == (0.0, 0.0, 0.0)
 
 
@@ -159,22 +159,22 @@ def test_exact_poses_have_no_noise(small_capture: Path, small_features: Path) ->
 def test_a_wrong_focal_length_of_the_map_is_named(
     small_capture: Path, small_features: Path, factor: float, noise_deg: float
 ) -> None:
-    survey = survey_of(small_capture, small_features, "spot", noisy(noise_deg, 0.0, 1))
+    check = checked(small_capture, small_features, "spot", noisy(noise_deg, 0.0, 1))
     cameras, pairs = [], []
-    for camera in survey.images.cameras:
+    for camera in check.images.cameras:
         other = pycolmap.Camera(camera.todict())
         params = other.params
         params[[int(index) for index in other.focal_length_idxs()]] *= factor
         other.params = params
         cameras.append(other)
-    for pair in survey.sample:
+    for pair in check.sample:
         pixels = [
-            np.asarray(survey.images.cameras[index].img_from_cam(rays))
+            np.asarray(check.images.cameras[index].img_from_cam(rays))
             for index, rays in ((pair.i, pair.rays_i), (pair.j, pair.rays_j))
         ]
         rays = [rays_of(cameras[index], xy) for index, xy in zip((pair.i, pair.j), pixels, strict=True)]
         pairs.append(pair._replace(rays_i=rays[0], rays_j=rays[1]))
-    text = SurveyedPairs(pairs, survey.images.world_from_cams).misfit(cameras)
+    text = PosedPairs(pairs, check.images.world_from_cams).check_intrinsics(cameras)
     assert text.startswith("the focal length")
     if "times" in text:
         found = 1 / float(text.split(" are ")[1].split()[0])
@@ -186,23 +186,23 @@ def test_a_wrong_focal_length_of_the_map_is_named(
 def test_what_errors_of_slam_imitate_is_not_blamed_on_the_camera(small_capture: Path, small_features: Path) -> None:
     """KinectFusion's poses of KITCHEN ask for 2 % of the focal length; of 25 images, 2 draws in 40 were blamed."""
     for seed in (15, 16, 17):
-        survey = survey_of(small_capture, small_features, "spot", noisy(0.5, 0.01, seed))
+        check = checked(small_capture, small_features, "spot", noisy(0.5, 0.01, seed))
         change = np.array([-0.025, 0, 0, 0])
         pairs = [
             pair._replace(rays_i=_changed(pair.rays_i, change), rays_j=_changed(pair.rays_j, change))
-            for pair in survey.sample
+            for pair in check.sample
         ]
-        assert not SurveyedPairs(pairs, survey.images.world_from_cams).misfit(survey.images.cameras)
+        assert not PosedPairs(pairs, check.images.world_from_cams).check_intrinsics(check.images.cameras)
 
 
 def test_a_focal_length_one_percent_off_is_not_worth_a_word(small_capture: Path, small_features: Path) -> None:
-    survey = survey_of(small_capture, small_features, "spot", np.array)
+    check = checked(small_capture, small_features, "spot", np.array)
     change = np.array([0.01, 0, 0, 0])
     pairs = [
         pair._replace(rays_i=_changed(pair.rays_i, change), rays_j=_changed(pair.rays_j, change))
-        for pair in survey.sample
+        for pair in check.sample
     ]
-    assert not SurveyedPairs(pairs, survey.images.world_from_cams).misfit(survey.images.cameras)
+    assert not PosedPairs(pairs, check.images.world_from_cams).check_intrinsics(check.images.cameras)
 
 
 def rotations_of_cam_from_world(poses: Floats) -> Floats:
@@ -230,7 +230,7 @@ def rotations_of_cam_from_world(poses: Floats) -> Floats:
 def test_the_convention_that_would_fit_is_found(
     small_capture: Path, small_features: Path, device: str, change: Change, fits: str
 ) -> None:
-    found = consistency_of(survey_of(small_capture, small_features, device, change))
+    found = consistency_of(checked(small_capture, small_features, device, change))
     assert found.verdict == "inconsistent"
     assert found.fits.startswith(fits)
     assert bool(found.fits) == bool(fits)
@@ -245,29 +245,29 @@ def test_shuffled_poses_of_a_small_room_are_inconsistent(
     small_capture: Path, small_features: Path, device: str, seed: int
 ) -> None:
     """There, a wrong pose is rarely far from an epipolar line, but the images are turned otherwise."""
-    found = consistency_of(survey_of(small_capture, small_features, device, lambda poses: shuffled(poses, seed)))
+    found = consistency_of(checked(small_capture, small_features, device, lambda poses: shuffled(poses, seed)))
     assert found.verdict == "inconsistent"
 
 
 def test_coarse_poses_are_consistent(small_capture: Path, small_features: Path) -> None:
-    found = consistency_of(survey_of(small_capture, small_features, "ios", coarse))
+    found = consistency_of(checked(small_capture, small_features, "ios", coarse))
     assert found.agreeing < 0.5 * found.pairs
     assert found.verdict == "consistent"
 
 
 def test_a_few_images_tell_nothing(small_capture: Path, small_features: Path) -> None:
-    found = consistency_of(survey_of(small_capture, small_features, "ios", turned(OPENGL), count=3))
+    found = consistency_of(checked(small_capture, small_features, "ios", turned(OPENGL), count=3))
     assert found.verdict == "unknown"
     assert "too few" in found.text
 
 
 def test_lengths_follow_the_depth_of_the_scene(small_capture: Path, small_features: Path) -> None:
-    survey = survey_of(small_capture, small_features, "ios", np.array)
-    assert survey.length(metric=True) == 1.0, "a room is of a usual depth"
-    assert survey.typical_depth() == pytest.approx(5, abs=2)
+    check = checked(small_capture, small_features, "ios", np.array)
+    assert check.length(metric=True) == 1.0, "a room is of a usual depth"
+    assert check.typical_depth() == pytest.approx(5, abs=2)
     for factor in (0.01, 100.0):
-        other = survey_of(small_capture, small_features, "ios", scaled(factor))
-        assert other.length(metric=False) == pytest.approx(factor * survey.length(metric=False), rel=1e-9)
+        other = checked(small_capture, small_features, "ios", scaled(factor))
+        assert other.length(metric=False) == pytest.approx(factor * check.length(metric=False), rel=1e-9)
         assert 2 <= other.typical_depth() / other.length(metric=True) <= 16
 
 

@@ -5,12 +5,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
-from toolkit.mapping.pose_noise import PoseNoise, SurveyedPairs, VerifiedPair
+from toolkit.mapping.pose_noise import PosedPairs, PoseNoise, VerifiedPair
 
 NOISE_OF_RAYS = 2e-4
 
 
-def survey(seed: int, shifted: float, turn_deg: float = 0.0) -> SurveyedPairs:
+def posed_pairs(seed: int, shifted: float, turn_deg: float = 0.0) -> PosedPairs:
     """Return nine pairs of views of a wall with windows, with a share of matches of a window with its neighbor.
 
     Args:
@@ -30,20 +30,20 @@ def survey(seed: int, shifted: float, turn_deg: float = 0.0) -> SurveyedPairs:
         for pose in (first, second):
             noise = Rotation.from_rotvec(np.radians(turn_deg) * rng.normal(size=3)).as_matrix()
             poses.append(pose @ geometry.make_pose(noise, (0, 0, 0)))
-    return SurveyedPairs(pairs, np.array(poses))
+    return PosedPairs(pairs, np.array(poses))
 
 
 @pytest.mark.parametrize("shifted", [0.0, 0.2, 0.45])
 def test_windows_matched_with_their_neighbors_are_no_noise_of_exact_poses(shifted: float) -> None:
     """They made 0.6 deg of it: of a facade in ten photographs, 0.33 deg, so that deviations were 5 times too large."""
     for seed in range(4):
-        assert survey(seed, shifted).noise(1.0) == PoseNoise()
+        assert posed_pairs(seed, shifted).noise(1.0) == PoseNoise()
 
 
 def test_noise_is_measured_beside_wrong_matches() -> None:
-    for shifted, most_deg in ((0.0, 0.45), (0.2, 0.6)):
-        found = [survey(seed, shifted, turn_deg=0.3).noise(1.0) for seed in range(4)]
-        assert 0.2 < np.median([noise.rotation_deg for noise in found]) < most_deg
+    for shifted, max_deg in ((0.0, 0.45), (0.2, 0.6)):
+        found = [posed_pairs(seed, shifted, turn_deg=0.3).noise(1.0) for seed in range(4)]
+        assert 0.2 < np.median([noise.rotation_deg for noise in found]) < max_deg
 
 
 def test_two_cameras_that_almost_have_one_center() -> None:
@@ -55,4 +55,4 @@ def test_two_cameras_that_almost_have_one_center() -> None:
         shifted = points + 0.1 * along * rng.normal(size=(100, 1))
         pairs.append(VerifiedPair(0, 1, geometry.unit(points), geometry.unit(shifted), np.eye(4)))
     poses = np.stack([np.eye(4), geometry.make_pose(np.eye(3), 1e-7 * along)])
-    assert SurveyedPairs(pairs, poses).noise(1.0).position < 0.02
+    assert PosedPairs(pairs, poses).noise(1.0).position < 0.02

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from toolkit import geometry
 from toolkit.pose.base import Matches, RigQuery
-from toolkit.pose.map_matching import MAX_SHARES, Misfit, find_misfit
+from toolkit.pose.map_matching import MAX_SHARES, IntrinsicsCheck, check_intrinsics
 
 Floats = NDArray[np.float64]
 MAX_ERROR_DEG = 0.45
@@ -44,7 +44,7 @@ def judged(
     count: int = 300,
     depth: tuple[float, float] = (4.0, 15.0),
     rig_from_cams: Floats | None = None,
-) -> tuple[Misfit | None, Floats]:
+) -> tuple[IntrinsicsCheck | None, Floats]:
     """Return what is said of cameras, and the pose found with them: the true one is the identity."""
     rig_from_cams = np.stack([np.eye(4), TURNED])[: len(cameras)] if rig_from_cams is None else rig_from_cams
     matches, points = scene(np.random.default_rng(seed), rig_from_cams, count, depth)
@@ -52,65 +52,65 @@ def judged(
     inliers = matches[query.errors_deg(np.eye(4), matches, points) < 3]
     pose = query.refine(np.eye(4), inliers, points)
     assert pose is not None
-    return find_misfit(query, pose, matches, points, MAX_ERROR_DEG), pose
+    return check_intrinsics(query, pose, matches, points, MAX_ERROR_DEG), pose
 
 
 @pytest.mark.parametrize("factor", [0.6, 0.75, 0.9, 0.98, 1.02, 1.1, 1.37])
 def test_a_wrong_focal_length_is_found_with_the_one_that_fits(factor: float) -> None:
     camera = changed(factor)
-    misfit, pose = judged([camera])
-    assert misfit is not None
-    assert misfit.doubtful
-    assert misfit.focals_px([camera]) == pytest.approx([925], rel=0.004)
-    assert "the focal length that fits is 92" in misfit.reason([camera])
+    check, pose = judged([camera])
+    assert check is not None
+    assert check.doubtful
+    assert check.focals_px([camera]) == pytest.approx([925], rel=0.004)
+    assert "the focal length that fits is 92" in check.reason([camera])
     # The shift leads from the pose with the wrong focal length to the true one.
     off_m = np.linalg.norm(geometry.invert(pose)[:3, 3])
-    assert np.linalg.norm(misfit.shift[3:]) == pytest.approx(off_m, abs=0.03)
+    assert np.linalg.norm(check.shift[3:]) == pytest.approx(off_m, abs=0.03)
 
 
 def test_a_wrong_principal_point_and_a_distortion_left_out_are_no_focal_length() -> None:
     for camera, says in ((changed(x=0.03), "principal point that fits is 48"), (changed(k1=0.1), "radial distortion")):
-        misfit, _ = judged([camera])
-        assert misfit is not None
-        assert misfit.doubtful
-        assert np.isnan(misfit.focals_px([camera])).all()
-        assert says in misfit.reason([camera])
+        check, _ = judged([camera])
+        assert check is not None
+        assert check.doubtful
+        assert np.isnan(check.focals_px([camera])).all()
+        assert says in check.reason([camera])
 
 
 def test_noise_does_not_look_like_a_wrong_camera() -> None:
     """Of 300 right cameras, with few matches and with many, none is doubted."""
     said = [judged([TRUE], seed, count)[0] for seed in range(100) for count in (20, 60, 300)]
-    assert [misfit for misfit in said if misfit is not None] == []
+    assert [check for check in said if check is not None] == []
 
 
 def test_a_plane_that_faces_the_camera_says_nothing_of_the_focal_length() -> None:
-    misfit, pose = judged([changed(1.1)], depth=(8.0, 8.0))
-    assert misfit is None
+    check, pose = judged([changed(1.1)], depth=(8.0, 8.0))
+    assert check is None
     assert abs(geometry.invert(pose)[2, 3]) > 0.5, "the distance makes up for it"
 
 
 def test_of_a_rig_the_wrong_camera_is_named() -> None:
     cameras = [TRUE, changed(0.9)]
-    misfit, _ = judged(cameras)
-    assert misfit is not None
-    right, wrong = misfit.focals_px(cameras)
+    check, _ = judged(cameras)
+    assert check is not None
+    right, wrong = check.focals_px(cameras)
     assert np.isnan(right)
     assert wrong == pytest.approx(925, rel=0.004)
-    assert misfit.reason(cameras).startswith("camera 2 of 2: ")
+    assert check.reason(cameras).startswith("camera 2 of 2: ")
 
 
 def test_all_cameras_of_a_rig_may_be_wrong() -> None:
     cameras = [changed(0.9), changed(0.9)]
-    misfit, _ = judged(cameras)
-    assert misfit is not None
-    assert misfit.focals_px(cameras) == pytest.approx([925, 925], rel=0.004)
+    check, _ = judged(cameras)
+    assert check is not None
+    assert check.focals_px(cameras) == pytest.approx([925, 925], rel=0.004)
 
 
-def test_a_small_misfit_is_significant_but_no_reason_to_doubt() -> None:
-    misfit, _ = judged([changed(x=0.02)], count=3000)
-    assert misfit is not None
-    assert 0 < misfit.shares.max() == misfit.shares[0, 1] < MAX_SHARES[1]
-    assert not misfit.doubtful
+def test_a_small_contradiction_is_significant_but_no_reason_to_doubt() -> None:
+    check, _ = judged([changed(x=0.02)], count=3000)
+    assert check is not None
+    assert 0 < check.shares.max() == check.shares[0, 1] < MAX_SHARES[1]
+    assert not check.doubtful
 
 
 @pytest.mark.parametrize("factor", [0.1, 0.2, 0.33, 3.0, 5.0, 10.0])
@@ -121,10 +121,10 @@ def test_an_absurd_focal_length_is_found_from_the_pose_that_it_gave(factor: floa
     query = RigQuery([camera], np.eye(4)[None], [[]])
     pose = query.ransac(matches, points, MAX_ERROR_DEG, seed=0, max_trials=1000)
     assert pose is not None
-    misfit = find_misfit(query, pose, matches, points, MAX_ERROR_DEG)
-    assert misfit is not None
-    assert misfit.doubtful
-    assert misfit.focals_px([camera]) == pytest.approx([925], rel=0.01)
+    check = check_intrinsics(query, pose, matches, points, MAX_ERROR_DEG)
+    assert check is not None
+    assert check.doubtful
+    assert check.focals_px([camera]) == pytest.approx([925], rel=0.01)
 
 
 @pytest.mark.parametrize("camera", [changed(x=-0.5), changed(k1=-44.0), changed(k1=5.0)], ids=["center", "fold", "k1"])
@@ -132,11 +132,11 @@ def test_other_absurd_intrinsics_are_doubted(camera: pycolmap.Camera) -> None:
     matches, points = scene(np.random.default_rng(1), np.eye(4)[None], 300, (4.0, 15.0))
     query = RigQuery([camera], np.eye(4)[None], [[]])
     pose = query.ransac(matches, points, MAX_ERROR_DEG, seed=0)
-    misfit = None if pose is None else find_misfit(query, pose, matches, points, MAX_ERROR_DEG)
-    assert pose is None or (misfit is not None and misfit.doubtful)
+    check = None if pose is None else check_intrinsics(query, pose, matches, points, MAX_ERROR_DEG)
+    assert pose is None or (check is not None and check.doubtful)
 
 
-def test_another_camera_with_more_inliers_all_over_the_same_image_is_no_misfit() -> None:
+def test_another_camera_with_more_inliers_all_over_the_same_image_is_no_contradiction() -> None:
     """By night, where windows repeat, few matches are right, and more may fit another camera and pose."""
     rng = np.random.default_rng(0)
     right, points = scene(rng, np.eye(4)[None], 100, (4.0, 15.0))
@@ -149,7 +149,7 @@ def test_another_camera_with_more_inliers_all_over_the_same_image_is_no_misfit()
     matches = Matches(np.zeros(len(pixels), np.int64), pixels, np.arange(len(pixels)))
     query = RigQuery([TRUE], np.eye(4)[None], [[]])
     pose = query.refine(np.eye(4), matches[np.arange(20, 100)], points)
-    assert find_misfit(query, pose, matches, points, MAX_ERROR_DEG) is None
+    assert check_intrinsics(query, pose, matches, points, MAX_ERROR_DEG) is None
 
 
 def test_errors_that_neighbors_share_do_not_look_like_a_wrong_camera() -> None:
@@ -163,8 +163,8 @@ def test_errors_that_neighbors_share_do_not_look_like_a_wrong_camera() -> None:
         shaken = Matches(matches.camera, pixels + shift, matches.point)
         query = RigQuery([TRUE], np.eye(4)[None], [[]])
         pose = query.refine(np.eye(4), shaken[query.errors_deg(np.eye(4), shaken, points) < 3], points)
-        misfit = find_misfit(query, pose, shaken, points, MAX_ERROR_DEG)
-        doubted += misfit is not None and misfit.doubtful
+        check = check_intrinsics(query, pose, shaken, points, MAX_ERROR_DEG)
+        doubted += check is not None and check.doubtful
     assert doubted == 0
 
 
@@ -173,5 +173,5 @@ def test_noise_of_the_poses_of_the_map_is_not_blamed_on_the_camera() -> None:
     matches, points = scene(np.random.default_rng(0), rig, 300, (4.0, 15.0))
     query = RigQuery([camera], rig, [[]])
     pose = query.refine(np.eye(4), matches[query.errors_deg(np.eye(4), matches, points) < 3], points)
-    assert find_misfit(query, pose, matches, points, MAX_ERROR_DEG) is not None
-    assert find_misfit(query, pose, matches, points, MAX_ERROR_DEG, noise_deg=2.0) is None
+    assert check_intrinsics(query, pose, matches, points, MAX_ERROR_DEG) is not None
+    assert check_intrinsics(query, pose, matches, points, MAX_ERROR_DEG, noise_deg=2.0) is None

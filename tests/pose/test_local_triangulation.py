@@ -117,11 +117,11 @@ class Scene:
         return OnDemandLocalizer(posed, mapped, [(method, source or self.features.__getitem__)])
 
 
-def assert_right(estimate: QueryResult, most_m: float = 0.01) -> None:
+def assert_right(estimate: QueryResult, max_m: float = 0.01) -> None:
     assert estimate.world_from_rig is not None, estimate.status
     rotation_deg, distance_m = geometry.pose_error(estimate.world_from_rig, QUERY_POSE)
     assert rotation_deg < 0.1
-    assert distance_m < most_m
+    assert distance_m < max_m
 
 
 @pytest.mark.parametrize("alike", [True, False])

@@ -216,7 +216,7 @@ def test_a_wrong_focal_length_is_doubted_and_its_deviation_is_honest(room: World
     seen = room.look(camera, QUERY)
     estimate = ask(room.localizer(), [wrong(camera, 1.1)], np.eye(4)[None], [seen], [REFERENCES])
     assert estimate.reason == CAMERA
-    assert estimate.misfit
+    assert estimate.camera_contradicted
     assert estimate.focals_px == pytest.approx([camera.mean_focal_length()], rel=0.01)
     assert "the focal length that fits" in estimate.remark
     assert estimate.world_from_rig is not None
@@ -239,7 +239,7 @@ def test_the_pose_of_a_rig_is_the_rigs(room: World) -> None:
     features = [room.look(c, QUERY @ r) for c, r in zip(RIG_CAMERAS, RIG_FROM_CAMS, strict=True)]
     estimate = ask(room.localizer(), RIG_CAMERAS, RIG_FROM_CAMS, features, [REFERENCES] * 3)
     check(estimate, QUERY)
-    assert not estimate.misfit
+    assert not estimate.camera_contradicted
     assert set(rests_on(estimate)[0]) == {0, 1, 2}
 
 

@@ -101,13 +101,15 @@ def test_a_result_comes_back_from_its_row_and_arrays(posed: bool) -> None:
     pose, covariance = make_pose(np.eye(3), [1.0, 2.0, 3.0]), np.diag([1e-4] * 3 + [0.01] * 3)
     first = replace(QUERIES[5, "phone"], num_inliers=12, num_matches=30, p_correct=0.97, rmse_px=0.5, seconds=0.25)
     if posed:
-        written = replace(first, world_from_rig=pose, covariance=covariance, misfit=True, found_by="pnp+near")
+        written = replace(
+            first, world_from_rig=pose, covariance=covariance, camera_contradicted=True, found_by="pnp+near"
+        )
     else:
         written = replace(first, status=Status.FAILED, reason="too few inliers (3: within)", remark="torn.jpg")
     row = json.loads(json.dumps(written.to_row(5, "phone")))
     assert row["status"] == ("ok" if posed else "failed: too few inliers (3: within)")
     read = QueryResult.from_arrays(written.arrays()).with_row(row)
-    assert (read.world_from_rig is not None) == (read.covariance is not None) == read.misfit == posed
+    assert (read.world_from_rig is not None) == (read.covariance is not None) == read.camera_contradicted == posed
     for name in ("status", "reason", "remark", "num_inliers", "num_matches", "p_correct", "rmse_px", "seconds"):
         assert getattr(read, name) == getattr(written, name), name
     assert (read.found_by, read.images, read.references) == (written.found_by, written.images, written.references)

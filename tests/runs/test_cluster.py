@@ -97,14 +97,14 @@ def notes(items: Items) -> dict[str, int]:
     return {name: items.note(name) for name in items}
 
 
-@pytest.mark.parametrize("again", [False, True])
-def test_workers_write_to_the_same_folder(tmp_path: Path, here: Here, again: bool) -> None:
+@pytest.mark.parametrize("skip_existing", [True, False])
+def test_workers_write_to_the_same_folder(tmp_path: Path, here: Here, skip_existing: bool) -> None:
     with Items(tmp_path, {"by": 1}) as items:
         items.add("0", "old", {"value": np.array([-1])}, -1)
         items.add("1", "from 1", {"value": np.array([-1])}, -1)
-    with Items(tmp_path, {"by": 1}, again=again) as items:
-        assert items.spread(write, items.left(items_of(range(20))), (), "write", "item") == []
-        assert notes(items) == {str(item): item for item in range(20)} | ({} if again else {"1": -1})
+    with Items(tmp_path, {"by": 1}, skip_existing=skip_existing) as items:
+        assert items.distribute(write, items.left(items_of(range(20))), (), "write", "item") == []
+        assert notes(items) == {str(item): item for item in range(20)} | ({"1": -1} if skip_existing else {})
         assert {name: int(arrays["value"][0]) for name, arrays in items.items()} == notes(items)
     assert all(path.suffix == ".shard" for path in tmp_path.iterdir())
 
@@ -358,7 +358,7 @@ def test_local_workers_have_the_settings_and_the_folder_of_who_asks(
         notes = {tuple((tmp_path / str(number)).read_text().split()) for number in range(8)}
         assert {note[1:] for note in notes} == {("1", str(tmp_path), "None")}
         assert str(os.getpid()) not in {note[0] for note in notes}
-        with pytest.raises(DamagedError) as caught:  # a stage heals what it names
+        with pytest.raises(DamagedError) as caught:  # a stage makes anew what it names
             cluster.run(failing_share, [(tmp_path / "a.h5",)], [1], "fail", "file")
         assert caught.value.path == tmp_path / "a.h5"
         logging.getLogger("distributed.nanny").warning("Worker process still alive after 4.0 seconds, killing")

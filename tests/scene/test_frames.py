@@ -41,7 +41,7 @@ def answering(monkeypatch: pytest.MonkeyPatch) -> Callable[[Drive], list[tuple[i
     def answer(way: Drive) -> list[tuple[int, RoughPose | None]]:
         asked = list[tuple[int, RoughPose | None]]()
 
-        def localize(place: object, image: int, *_: object, near: RoughPose | None = None) -> QueryResult:
+        def localize(scene_map: object, image: int, *_: object, near: RoughPose | None = None) -> QueryResult:
             asked.append((image, near))
             if image == 6:
                 raise ImageError("torn")
@@ -70,7 +70,7 @@ def test_all_frames_have_poses_and_what_failed_is_asked_again(answering: Any) ->
     assert errors_of(done, way).max() < 0.3
     assert list(done.single) == way.queries.frames.tolist()
     failed = [frame for frame, estimate in done.single.items() if estimate.status.startswith("failed")]
-    assert list(done.again) == failed
+    assert list(done.relocalized) == failed
     assert {image for image, near in asked if near is not None} == {1, 4, 6, 7, 10, 13, 16, 19}
     assert done.single[int(way.queries.frames[6])].status_text == "failed: torn"
 
@@ -132,15 +132,15 @@ def test_a_camera_that_does_not_fit_its_picture_is_an_error_unlike_an_unreadable
     picture: Any, cameras: Any, rig_from_cams: Any, message: str
 ) -> None:
     sift = LocalMethod("sift", SiftExtractor(), MutualMatcher())
-    place = Map("ios", Path("sessions"), Path("maps"), LocalizeSettings(), [sift])
+    scene_map = Map("ios", Path("sessions"), Path("maps"), LocalizeSettings(), [sift])
     odometry = Odometry(np.zeros(1, np.int64), np.eye(4)[None])
     with pytest.raises(CameraError, match=message):
-        localize_sequence(place, [picture], cameras, odometry, None, rig_from_cams)
+        localize_sequence(scene_map, [picture], cameras, odometry, None, rig_from_cams)
     with pytest.raises(CameraError, match=message):
-        SequenceLocalizer(place, None, rig_from_cams).add(0, np.eye(4), picture, cameras)
-    done = localize_sequence(place, ["nowhere.jpg"], CAMERA, odometry)
+        SequenceLocalizer(scene_map, None, rig_from_cams).add(0, np.eye(4), picture, cameras)
+    done = localize_sequence(scene_map, ["nowhere.jpg"], CAMERA, odometry)
     assert done.single[0].status_text == "failed: Image not found: nowhere.jpg"
-    localizer = SequenceLocalizer(place)
+    localizer = SequenceLocalizer(scene_map)
     assert localizer.add(0, np.eye(4), "nowhere.jpg", CAMERA).status.startswith("failed")
     assert localizer.single is not None
     assert localizer.single.status == done.single[0].status

@@ -70,9 +70,9 @@ def scripted_map(
 OK, LOW = QueryResult(Status.OK, "", np.eye(4)), QueryResult(Status.LOW_CONFIDENCE, "", np.eye(4))
 VAGUE = replace(OK, covariance=np.eye(6))
 FAILED = QueryResult.failed("no consistent pose")
-DOUBTED = QueryResult(Status.LOW_CONFIDENCE, CAMERA, np.eye(4), misfit=True)
+DOUBTED = QueryResult(Status.LOW_CONFIDENCE, CAMERA, np.eye(4), camera_contradicted=True)
 ALIKE = replace(LOW, rivals=(Rival(np.eye(4), 0.95),))
-SLIGHT = replace(VAGUE, misfit=True)  # a misfit that shows in the covariance alone
+SLIGHT = replace(VAGUE, camera_contradicted=True)  # a contradiction that shows in the covariance alone
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from toolkit import geometry
 from toolkit.geometry import Floats
 from toolkit.manifest import SequenceSettings
-from toolkit.sequences.odometry import LEAST_STD_DEG, LEAST_STD_M, Odometry, PosedQueries
+from toolkit.sequences.odometry import MIN_STD_DEG, MIN_STD_M, Odometry, PosedQueries
 
 PLACE = geometry.make_pose(Rotation.from_rotvec([0.0, 0.0, 2.3]).as_matrix(), [100.0, -20.0, 3.0])
 """world_from_odom."""
@@ -50,7 +50,7 @@ def drive(
     is_wrong[rng.permutation(len(asked))[: round(wrong * len(asked))]] = True
     for number in np.flatnonzero(is_wrong):
         poses[number] = geometry.make_pose(Rotation.random(random_state=rng).as_matrix(), rng.uniform(-100, 100, 3))
-    least = np.deg2rad(LEAST_STD_DEG), LEAST_STD_M  # which is added
+    least = np.deg2rad(MIN_STD_DEG), MIN_STD_M  # which is added
     covariance = np.diag(np.repeat(np.square(stds) - np.square(least), 3))
     queries = PosedQueries(
         asked, poses, np.tile(covariance, (len(asked), 1, 1)), np.full(len(asked), 0.9), np.ones(len(asked), bool)

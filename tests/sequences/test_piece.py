@@ -27,7 +27,7 @@ def test_what_failed_or_contradicts_is_asked_again_and_then_counts() -> None:
     asked = np.append(way.queries.frames, 39)  # the last has no pose
     seen: list[int] = []
 
-    def again(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
+    def relocalize(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
         seen.extend(frame for frame, _ in todo)
         for frame, about in todo:
             rotation_deg, distance_m = geometry.pose_error(about.world_from_rig, way.world_from_rig[frame])
@@ -36,9 +36,9 @@ def test_what_failed_or_contradicts_is_asked_again_and_then_counts() -> None:
         return [answer(way, frame) for frame, _ in todo]
 
     before = localize_piece(way.odometry, way.queries, asked, SETTINGS)
-    done = localize_piece(way.odometry, way.queries, asked, SETTINGS, again)
+    done = localize_piece(way.odometry, way.queries, asked, SETTINGS, relocalize)
     assert seen == [*way.queries.frames[way.is_wrong], 39]
-    assert list(done.again) == seen
+    assert list(done.relocalized) == seen
     first, second = (
         geometry.pose_error(each.placed.world_from_rig[seen], way.world_from_rig[seen])[1] for each in (before, done)
     )
@@ -88,10 +88,10 @@ def test_a_piece_without_a_pose_is_not_searched_for() -> None:
     way = drive(np.random.default_rng(4))
     nothing: PosedQueries = way.queries.choose(np.zeros(0, np.int64))
 
-    def again(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
+    def relocalize(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
         raise AssertionError
 
-    done = localize_piece(way.odometry, nothing, np.array([3, 5]), SETTINGS, again)
+    done = localize_piece(way.odometry, nothing, np.array([3, 5]), SETTINGS, relocalize)
     assert all(status.startswith("failed") for status in done.placed.status)
     assert np.isnan(done.steps["voted"]).all()
 
@@ -102,14 +102,14 @@ def test_online_a_query_is_found_again_from_the_past_alone() -> None:
     queries = way.queries.choose(way.queries.frames < 20)
     rough: dict[int, RoughPose] = {}
 
-    def again(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
+    def relocalize(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
         rough.update(todo)
         return [answer(way, frame) for frame, _ in todo]
 
     asked = np.array([10, 25, 30])
-    done = localize_piece(way.odometry, queries, asked, settings, again)
+    done = localize_piece(way.odometry, queries, asked, settings, relocalize)
     assert sorted(rough) == [25, 30]
     later = queries.choose(queries.frames < 12)
-    localize_piece(way.odometry, later, np.array([10, 11]), settings, again)
+    localize_piece(way.odometry, later, np.array([10, 11]), settings, relocalize)
     assert geometry.pose_error(done.placed.world_from_rig[30], way.world_from_rig[30])[1] < 0.05
     assert np.isfinite(done.placed.world_from_rig[25]).all()

@@ -17,7 +17,7 @@ import pytest
 from toolkit.errors import DamagedError, sentence
 from toolkit.files import sidecar_path
 from toolkit.store import items as store
-from toolkit.store.items import Items, heals
+from toolkit.store.items import Items, retry_damaged
 
 
 def add(items: Items, *names: str, source: str = "key") -> None:
@@ -81,7 +81,7 @@ def test_items_can_all_be_made_again(tmp_path: Path) -> None:
     todo = [("a", "key"), ("b", "key")]
     with Items(tmp_path) as items:
         add(items, "a", "b")
-    with Items(tmp_path, again=True) as items:
+    with Items(tmp_path, skip_existing=False) as items:
         assert items.left(todo) == todo
         add(items, "a")
         items.flush()
@@ -171,7 +171,7 @@ def test_a_reader_follows_items_to_a_later_shard(tmp_path: Path) -> None:
     with Items(tmp_path) as items:
         add(items, "a")
     reader = Items(tmp_path)
-    with Items(tmp_path, again=True) as items:
+    with Items(tmp_path, skip_existing=False) as items:
         add(items, "a", "b")
     assert len(shards(tmp_path)) == 1
     assert reader["a"]["values"][0] == ord("a")
@@ -212,7 +212,7 @@ def test_whatever_byte_changes_no_other_number_is_read(tmp_path: Path, caplog: p
 def test_a_damaged_item_is_noticed_and_made_again_alone(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     made = list[str]()
 
-    @heals
+    @retry_damaged
     def stage() -> dict[str, list[float]]:
         with Items(tmp_path) as items:
             todo = [name for name, _ in items.left([("a", "key"), ("b", "key"), ("c", "key")])]
@@ -235,7 +235,7 @@ def test_a_damaged_item_is_noticed_and_made_again_alone(tmp_path: Path, caplog: 
 def test_damage_that_comes_back_is_an_error(tmp_path: Path) -> None:
     tries: list[int] = []
 
-    @heals
+    @retry_damaged
     def stage() -> None:
         tries.append(1)
         with Items(tmp_path) as items:
@@ -247,7 +247,7 @@ def test_damage_that_comes_back_is_an_error(tmp_path: Path) -> None:
         stage()
     assert len(tries) == 2
 
-    @heals
+    @retry_damaged
     def other() -> None:
         raise DamagedError(tmp_path / "theirs.h5", "theirs.h5")
 

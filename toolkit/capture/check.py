@@ -24,7 +24,7 @@ from toolkit.capture.tables import (
     read_table,
     times_of,
 )
-from toolkit.capture.upright import estimate_world_up, posed_photographs
+from toolkit.capture.upright import estimate_world_up, posed_images
 from toolkit.errors import COMMAND, CaptureError, ImageError
 from toolkit.files import RAW_DATA, read_json
 from toolkit.geometry import unit
@@ -329,7 +329,7 @@ class _SessionCheck:
     def _check_map_poses(self) -> None:
         """Report implausible map poses: all in one place, all with one rotation, or all cameras moving backwards."""
         session, file = self.session, "trajectories.txt"
-        poses, rows = posed_photographs(session)
+        poses, rows = posed_images(session)
         order = np.lexsort((times_of(session.images)[rows], session.subsession_of(rows).astype(str)))
         poses, recording = poses[order], session.subsession_of(rows)[order]
         if len(poses) < 3:
@@ -381,7 +381,7 @@ class _SessionCheck:
             elif what == "ground truth" and trajectory is session.trajectory:
                 note = "from trajectories.txt"
             add(what, len(trajectory), f"{posed:,} of {len(times):,} images have one", note)
-        if session.split == "map" and not self._has_errors and len(posed_photographs(session)[1]):
+        if session.split == "map" and not self._has_errors and len(posed_images(session)[1]):
             add("up in the world", None, estimate_world_up([session]).reason)
         add("depth maps", None if session.depths is None else len(session.depths), missing("depths.txt"))
         for what, signals in (("WiFi", session.wifi), ("Bluetooth", session.bluetooth)):

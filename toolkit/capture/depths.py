@@ -1,12 +1,12 @@
-"""The depth of photographs, from the depth maps of a capture.
+"""The depth of images, from the depth maps of a capture.
 
-In `depths.txt` of the official tools, a depth map belongs to a photograph in one of three ways:
+In `depths.txt` of the official tools, a depth map belongs to an image in one of three ways:
 
 - rendered for it: same timestamp, and its sensor id or `<prefix>/<sensor id>`, an id that is not in sensors.txt;
 - measured with it (phones): same timestamp, and its sensor id with `cam` replaced by `depth` in the last part;
 - measured by another sensor of its rig (headsets, robots), with its own intrinsics, pose in the rig and timestamps.
 
-In each case the points of the depth map are transformed to the photograph's camera, and occluded points are dropped.
+In each case the points of the depth map are transformed to the image's camera, and occluded points are dropped.
 """
 
 import logging
@@ -31,23 +31,23 @@ from toolkit.geometry import Floats, Ints
 
 log = logging.getLogger(__name__)
 
-# Largest time between a photograph and the depth map of another sensor: half the period of the slowest, at 5 Hz.
+# Largest time between an image and the depth map of another sensor: half the period of the slowest, at 5 Hz.
 MAX_OFFSET_US = 100_000
 MAX_GAP_US = 1_000_000  # largest time between two poses of a sensor to interpolate between them
-_MOST_POINTS = 30_000  # per depth map; enough for a few hundred features
+_MAX_POINTS = 30_000  # per depth map; enough for a few hundred features
 _HIDDEN = 1.1  # a point deeper than its nearest neighbor by this factor is occluded, or on an edge
 _CELL = 1.5  # width of a cell, in point spacings; only the nearest point of a cell is visible
 _FITTED = 8  # points that a plane is fitted to
 _UNEVEN = 0.05  # largest residual of a point to the plane, relative to the inverse depth
-_KEPT = 32  # photographs whose depth is cached
+_KEPT = 32  # images whose depth is cached
 
 
 @dataclass(frozen=True)
 class SeenDepth:
-    """Depth at some pixels of a photograph."""
+    """Depth at some pixels of an image."""
 
-    pixels: Floats  # (P, 2) pixels of the photograph, in row order from the top
-    depth_m: Floats  # (P,) depth along the photograph's optical axis, meters
+    pixels: Floats  # (P, 2) pixels of the image, in row order from the top
+    depth_m: Floats  # (P,) depth along the image's optical axis, meters
     cell_px: float = 1.0  # width of the grid cells, pixels; each cell has at most one point
     reason: str = ""  # which depth maps were left out and why; without points, why there are none
 
@@ -92,15 +92,15 @@ def lifted(camera: pycolmap.Camera, pixels: Floats, depth_m: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _DepthMap:
-    """A depth map that belongs to a photograph."""
+    """A depth map that belongs to an image."""
 
     path: str  # path relative to raw_data/
-    camera: pycolmap.Camera | None  # camera of the depth map; None: the photograph's camera, possibly resized
-    cam_from_depth: Floats  # (4, 4) pose of the depth sensor in the photograph's camera
+    camera: pycolmap.Camera | None  # camera of the depth map; None: the image's camera, possibly resized
+    cam_from_depth: Floats  # (4, 4) pose of the depth sensor in the image's camera
 
 
 class DepthMaps:
-    """The depth maps of a session by photograph. Thread-safe."""
+    """The depth maps of a session by image. Thread-safe."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -110,7 +110,7 @@ class DepthMaps:
         self._logged: set[str] = set()
 
     def _see(self, row: int) -> SeenDepth:
-        """Return the depth in a photograph, a row of `Session.images`: of each depth sensor of its camera, the depth
+        """Return the depth in an image, a row of `Session.images`: of each depth sensor of its camera, the depth
         map nearest in time, within `MAX_OFFSET_US`. One that cannot be read or does not fit is left out, and logged
         once.
         """
@@ -158,7 +158,7 @@ class DepthMaps:
         return {str(key): [str(i) for i in group] for key, group in pairs.groupby("sensor_id")["sensor_id_depth"]}
 
     def _sources(self, row: int, timestamp: int, sensor: str) -> tuple[list[_DepthMap], list[str]]:
-        """Return the depth maps of a photograph, and the reasons why others are left out."""
+        """Return the depth maps of an image, and the reasons why others are left out."""
         session = self._session
         if session.depths is None:
             return [], []
@@ -211,23 +211,23 @@ class DepthMaps:
         rotation = Slerp([0, 1], Rotation.from_matrix(poses[after - 1 : after + 1, :3, :3]))(share).as_matrix()
         return geometry.make_pose(rotation, (1 - share) * poses[after - 1, :3, 3] + share * poses[after, :3, 3])
 
-    def _points(self, source: _DepthMap, photograph: pycolmap.Camera) -> tuple[Floats, float]:
-        """Return the points (P, 3) of a depth map in the photograph's camera, and their spacing in its pixels."""
+    def _points(self, source: _DepthMap, image_camera: pycolmap.Camera) -> tuple[Floats, float]:
+        """Return the points (P, 3) of a depth map in the image's camera, and their spacing in its pixels."""
         path = self._session.path / RAW_DATA / source.path
         depth = read_depth(path)
         height, width = depth.shape
-        camera = source.camera or photograph
+        camera = source.camera or image_camera
         resized = source.camera is None and abs(width - height * camera.width / camera.height) <= 1
         if not resized and (width, height) != (camera.width, camera.height):
             expected = f"{camera.width} x {camera.height}" + (", or that aspect ratio" if source.camera is None else "")
             raise CaptureError(f"Depth map {path}: found {width} x {height} pixels, expected {expected}.")
-        step = int(np.ceil(np.sqrt(max(np.count_nonzero(depth) / _MOST_POINTS, 1.0))))
+        step = int(np.ceil(np.sqrt(max(np.count_nonzero(depth) / _MAX_POINTS, 1.0))))
         y, x = np.nonzero(depth[step // 2 :: step, step // 2 :: step])
         y, x = y * step + step // 2, x * step + step // 2
         size = np.array([camera.width / width, camera.height / height])
         points = lifted(camera, (np.column_stack([x, y]) + 0.5) * size, depth[y, x].astype(np.float64))
         points = points[np.isfinite(points).all(axis=1)]
-        spacing_px = step * size.max() * photograph.mean_focal_length() / camera.mean_focal_length()
+        spacing_px = step * size.max() * image_camera.mean_focal_length() / camera.mean_focal_length()
         return geometry.transform(source.cam_from_depth, points), float(spacing_px)
 
 

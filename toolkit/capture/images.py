@@ -31,8 +31,8 @@ T = TypeVar("T")
 R = TypeVar("R")
 WORKERS = "TOOLKIT_WORKERS"  # environment variable with the number of threads that this process may use
 THREAD_BYTES = 1 << 29  # memory to reserve for each thread, bytes: SIFT of 4000 x 3000 pixels takes 460 MB
-MOST_BYTES = 1 << 30  # largest size of an image file, bytes
-MOST_PIXELS = 1 << 28  # of a decoded image: 268 million, 0.8 GB in color; a tiny file can declare many more
+MAX_BYTES = 1 << 30  # largest size of an image file, bytes
+MAX_PIXELS = 1 << 28  # of a decoded image: 268 million, 0.8 GB in color; a tiny file can declare many more
 # JPEG and PNG bypass `PIL.Image.open`, whose limit of pixels is below the resolution of recent phones.
 _HEADER_READERS: dict[bytes, Callable[[Any], PIL.Image.Image]] = {
     b"\xff\xd8": JpegImagePlugin.JpegImageFile,
@@ -55,7 +55,7 @@ NO_FILE = "no such file"
 EXIF_CAMERA = (0x010F, 0x0110, _FOCAL_MM, _FOCAL_35MM)
 """EXIF tags that distinguish cameras: make, model and focal lengths."""
 _FILM_DIAGONAL_MM = float(np.hypot(36, 24))
-CAMERA_TYPES = ("camera", "depth")  # sensor types with intrinsics; only `camera` takes photographs
+CAMERA_TYPES = ("camera", "depth")  # sensor types with intrinsics; only `camera` takes images
 WIDE = ("FISHEYE", "FOV", "EUCM")  # ends of the names of models for fields of view of 180 degrees and more
 _LARGEST = 2**31 - 1  # largest image side, pixels; COLMAP cannot hold larger numbers
 
@@ -78,8 +78,8 @@ def _open(path: str | Path) -> Iterator[BinaryIO]:
         status = os.stat(path)  # noqa: PTH116 - twice as fast as Path.stat
         if not stat.S_ISREG(status.st_mode):  # opening a pipe blocks forever, reading a device never ends
             raise ImageError(f"Image cannot be read: {path} is a folder, a pipe or a device, expected a file")
-        if status.st_size > MOST_BYTES:
-            raise ImageError(f"Image cannot be read: {path} has more than {MOST_BYTES:,} bytes")
+        if status.st_size > MAX_BYTES:
+            raise ImageError(f"Image cannot be read: {path} has more than {MAX_BYTES:,} bytes")
         with open(path, "rb") as stream:
             yield stream
     except FileNotFoundError:
@@ -98,15 +98,15 @@ def stored_size(path: str | Path) -> tuple[int, int]:
             raise ImageError(f"Image cannot be decoded ({error}): {path}") from None
 
 
-def open_lazily(stream: BinaryIO, most_pixels: float = MOST_PIXELS) -> PIL.Image.Image:
+def open_lazily(stream: BinaryIO, max_pixels: float = MAX_PIXELS) -> PIL.Image.Image:
     """Return an image of which only the header is read yet. Raise one of `HEADER_ERRORS` if it has too many pixels."""
     first = stream.read(12)
     stream.seek(0)
     if _is_heic(first) and not heic_is_read():
         raise ValueError(f"HEIC is not read: {HEIC_HOW}")
     image = next(read for start, read in _HEADER_READERS.items() if first.startswith(start))(stream)
-    if image.width * image.height > most_pixels:
-        raise ValueError(f"{image.width} x {image.height} pixels, more than {most_pixels:,}")
+    if image.width * image.height > max_pixels:
+        raise ValueError(f"{image.width} x {image.height} pixels, more than {max_pixels:,}")
     return image
 
 
@@ -124,14 +124,14 @@ def heic_is_read() -> bool:
     return True
 
 
-def decode(path: str | Path, flags: int, least_side: int | None = None, longest: int | None = None) -> NDArray[Any]:
+def decode(path: str | Path, flags: int, min_side: int | None = None, longest: int | None = None) -> NDArray[Any]:
     """Return the pixels of an image file as OpenCV decodes it with `flags`; HEIC by Pillow, upright.
 
     Args:
-        least_side, longest: see `read_image`; a JPEG is decoded at a smaller size that suffices. Both add to `flags`.
+        min_side, longest: see `read_image`; a JPEG is decoded at a smaller size that suffices. Both add to `flags`.
 
     Raises:
-        ImageError: see `read_file`; or the file is not an image, is truncated, or has more than `MOST_PIXELS` pixels.
+        ImageError: see `read_file`; or the file is not an image, is truncated, or has more than `MAX_PIXELS` pixels.
     """
     data = read_file(path)
     size = 0, 0
@@ -142,10 +142,10 @@ def decode(path: str | Path, flags: int, least_side: int | None = None, longest:
             return pixels if gray else np.ascontiguousarray(pixels[..., ::-1])
         with suppress(*HEADER_ERRORS[:-1]):  # OpenCV decides whether it is an image
             size = open_lazily(BytesIO(data), np.inf).size
-        if size[0] * size[1] > MOST_PIXELS:
-            raise ValueError(f"{size[0]} x {size[1]} pixels, more than {MOST_PIXELS:,}")
-        if data.startswith(b"\xff\xd8") and (least_side or longest):  # reducing saves time only for JPEG
-            most = min(size) // least_side if least_side else max(size) // (longest or 1)
+        if size[0] * size[1] > MAX_PIXELS:
+            raise ValueError(f"{size[0]} x {size[1]} pixels, more than {MAX_PIXELS:,}")
+        if data.startswith(b"\xff\xd8") and (min_side or longest):  # reducing saves time only for JPEG
+            most = min(size) // min_side if min_side else max(size) // (longest or 1)
             # With a remainder, the last row and column would cover fewer pixels and shift all others.
             fitting = (flag for factor, flag in _REDUCED.items() if factor <= most and not np.any(np.mod(size, factor)))
             flags |= next(fitting, 0)
@@ -158,7 +158,7 @@ def decode(path: str | Path, flags: int, least_side: int | None = None, longest:
 
 
 def read_image(
-    path: str | Path, gray: bool = False, least_side: int | None = None, longest: int | None = None
+    path: str | Path, gray: bool = False, min_side: int | None = None, longest: int | None = None
 ) -> NDArray[np.uint8]:
     """Return an image as stored, (H, W, 3) RGB uint8, or (H, W) if `gray`.
 
@@ -166,19 +166,19 @@ def read_image(
     is missing or cannot be decoded; see `decode`.
 
     Args:
-        least_side: decode a color JPEG at 1/8, 1/4 or 1/2 of its size if both sides stay whole numbers and the shorter
+        min_side: decode a color JPEG at 1/8, 1/4 or 1/2 of its size if both sides stay whole numbers and the shorter
             one has at least this many pixels. Saves time for callers that reduce the image anyway. None: full size.
         longest: reduce the image to a longer side of at most this many pixels, without aliasing. None: do not.
     """
     flags = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR
-    sizes = (None, None) if gray else (least_side, longest)
+    sizes = (None, None) if gray else (min_side, longest)
     image = decode(path, flags | cv2.IMREAD_IGNORE_ORIENTATION, *sizes)
     image = np.asarray(image if gray else cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
     return image if longest is None else shrunk(image, longest)
 
 
 def pixels_of(
-    image: str | Path | NDArray[np.uint8], gray: bool = False, least_side: int | None = None
+    image: str | Path | NDArray[np.uint8], gray: bool = False, min_side: int | None = None
 ) -> NDArray[np.uint8]:
     """Return an image in gray, (H, W), or in color, (H, W, 3) RGB.
 
@@ -188,7 +188,7 @@ def pixels_of(
         image: a file, see `read_image`; or pixels (H, W) or (H, W, 3) RGB uint8.
     """
     if isinstance(image, str | Path):
-        return read_image(image, gray, least_side)
+        return read_image(image, gray, min_side)
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
         raise ImageError(f"Found pixels {image.shape} {image.dtype}: expected (H, W) or (H, W, 3) uint8.")
     if gray == (image.ndim == 2):
@@ -298,7 +298,7 @@ def find_mask(image: Path, masks: Path | None = None) -> Path | None:
 def read_header(path: Path) -> tuple[tuple[int, int], dict[int, Any]]:
     """Return the stored width and height of an image, and its EXIF tags by number.
 
-    Raise ImageError if the file is missing, not an image, or has more than `MOST_PIXELS` pixels.
+    Raise ImageError if the file is missing, not an image, or has more than `MAX_PIXELS` pixels.
     """
     if not is_file(path):
         raise ImageError(NO_FILE)

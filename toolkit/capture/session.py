@@ -669,7 +669,7 @@ class Capture:
     ) -> list[tuple[str, str]]:
         """Return (map device, query device) of all pairs of devices as in `devices_with`, or else the given `pairs`."""
         if pairs is not None:
-            return [(map_, query) for map_, query in pairs]
+            return [(mapped, query) for mapped, query in pairs]
         return list(product(self.devices_with("map", map_device), self.devices_with("query", query_device)))
 
     def folder(self, session_id: str) -> Path:

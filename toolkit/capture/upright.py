@@ -1,7 +1,7 @@
 """Find what is up in a capture's world, and the quarter turns that make the images of each sensor upright.
 
-Headset and robot cameras are mounted rotated, and phones store portrait photographs in landscape. Networks trained on
-upright photographs expect upright images. `k` is always the number of COUNTER-CLOCKWISE quarter turns of the image, as
+Headset and robot cameras are mounted rotated, and phones store portrait images in landscape. Networks trained on
+upright images expect upright images. `k` is always the number of COUNTER-CLOCKWISE quarter turns of the image, as
 in `np.rot90`.
 
     turns = quarter_turns([capture["hl_map"], capture["ios_map"]], world_up=None)
@@ -129,7 +129,7 @@ def _posed_cameras(sessions: Sequence[Session]) -> tuple[Floats, Floats, Ints]:
     poses: list[Floats] = []
     roles: list[pd.Series] = []
     for session in sessions:
-        world_from_cam, rows = posed_photographs(session)
+        world_from_cam, rows = posed_images(session)
         role = sensor_names(session, session.images["sensor_id"]).iloc[rows]["role"]
         # Sort by camera before sampling: a stride through a rig's frames could always pick the same camera.
         order = np.argsort(pd.factorize(role)[0], kind="stable")
@@ -146,8 +146,8 @@ def _posed_cameras(sessions: Sequence[Session]) -> tuple[Floats, Floats, Ints]:
     return world_from_cam[:, :3, :3], world_from_cam[:, :3, 3], groups.astype(np.int64)
 
 
-def posed_photographs(session: Session) -> tuple[Floats, Ints]:
-    """Return world_from_cam, (n, 4, 4), of the photographs of a session that have a pose, and their rows (n,)."""
+def posed_images(session: Session) -> tuple[Floats, Ints]:
+    """Return world_from_cam, (n, 4, 4), of the images of a session that have a pose, and their rows (n,)."""
     poses = session.world_from_cam(ground_truth=session.trajectory is None)
     rows = session.camera_rows
     rows = rows[np.isfinite(poses[rows]).all((1, 2))]
@@ -383,7 +383,7 @@ def quarter_turns(maps: Sequence[Session], world_up: ArrayLike | None = None) ->
     tables = [pd.DataFrame({kind: [] for kind in SHARES}, dtype=object)]
     rotations = [np.zeros((0, 3, 3))]
     for session in maps:
-        world_from_cam, rows = posed_photographs(session)
+        world_from_cam, rows = posed_images(session)
         tables.append(sensor_names(session, session.images["sensor_id"].iloc[rows]))
         rotations.append(world_from_cam[:, :3, :3])
     names = pd.concat(tables[1:] or tables, ignore_index=True)

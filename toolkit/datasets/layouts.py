@@ -27,7 +27,7 @@ from toolkit.geometry import Floats, invert, make_pose, pose_from_qt
 from toolkit.manifest import nearest, require_known
 
 HOLD_OUT = 8
-"""Every such photograph becomes a query, in data sets without a split."""
+"""Every such image becomes a query, in data sets without a split."""
 _SEVEN_SCENES = (525.0, 525.0, 320.0, 240.0)  # of the color camera, as usual for this data set; none is published
 _TWELVE_SCENES = (572.0, 572.0, 320.0, 240.0)  # at 640 x 480, where a scene has no info.txt
 _TUM = {
@@ -38,7 +38,7 @@ _TUM = {
 """Intrinsics of the color cameras, from the data set's page."""
 
 
-class Photograph(NamedTuple):
+class ListedImage(NamedTuple):
     """An image of a data set."""
 
     name: str  # path in the folder of the images
@@ -51,7 +51,7 @@ class Photograph(NamedTuple):
 class Layout(NamedTuple):
     """How a data set is read."""
 
-    read: Callable[[Path], tuple[Path, list[Photograph]]]  # from a scene's folder: the folder of its images, and these
+    read: Callable[[Path], tuple[Path, list[ListedImage]]]  # from a scene's folder: the folder of its images, and these
     thresholds: Sequence[tuple[float, float]]  # of recall, as usual for the data set: degrees, meters
     example: str  # a file that tells a scene's folder
     depth: Callable[[Path], dict[str, Any]] = lambda _: {}
@@ -92,7 +92,7 @@ def import_dataset(
         options |= layout.depth(folder)
     draft = start(capture, device, "map", root, **options)
     draft.record["meters"] = f"the files of {kind}"
-    numbers, taken = Counter[str](), list[Photograph]()
+    numbers, taken = Counter[str](), list[ListedImage]()
     for image in sorted(images, key=lambda image: image.name):
         number = numbers[parent := str(Path(image.name).parent)]
         numbers[parent] += 1
@@ -151,7 +151,7 @@ def _first(paths: Iterable[Path], folder: Path, expected: str) -> Path:
 # The layouts
 
 
-def _seven_scenes(folder: Path) -> tuple[Path, list[Photograph]]:
+def _seven_scenes(folder: Path) -> tuple[Path, list[ListedImage]]:
     camera = camera_at(folder, ", ".join(map(str, ("PINHOLE", 640, 480, *_SEVEN_SCENES))))
     images = []
     for file, split in (("TrainSplit.txt", "map"), ("TestSplit.txt", "query")):
@@ -163,13 +163,13 @@ def _seven_scenes(folder: Path) -> tuple[Path, list[Photograph]]:
             if not recording.is_dir():
                 raise CaptureError(f"{recording}: no such folder. Unpack {recording.name}.zip there.")
             images += [
-                Photograph(path.relative_to(folder).as_posix(), split, camera, _pose_of(path))
+                ListedImage(path.relative_to(folder).as_posix(), split, camera, _pose_of(path))
                 for path in recording.glob("*.color.png")
             ]
     return folder, images
 
 
-def _twelve_scenes(folder: Path) -> tuple[Path, list[Photograph]]:
+def _twelve_scenes(folder: Path) -> tuple[Path, list[ListedImage]]:
     first = _first((folder / "data").glob("*.color.jpg"), folder, "data/*.color.jpg")
     size = _size(first)
     if isinstance(size, str):
@@ -184,7 +184,7 @@ def _twelve_scenes(folder: Path) -> tuple[Path, list[Photograph]]:
     for path in (folder / "data").glob("*.color.jpg"):
         split = "query" if int(re.sub(r"\D", "", path.name.split(".")[0]) or -1) in tested else "map"
         name = path.relative_to(folder).as_posix()
-        images.append(Photograph(name, split, camera, _pose_of(path)))
+        images.append(ListedImage(name, split, camera, _pose_of(path)))
     return folder, images
 
 
@@ -208,7 +208,7 @@ def _depth_in(name: str, pattern: str, **options: Any) -> Callable[[Path], dict[
     return lambda folder: {"depth": folder / name, **options} if any(folder.glob(pattern)) else {}
 
 
-def _cambridge(folder: Path) -> tuple[Path, list[Photograph]]:
+def _cambridge(folder: Path) -> tuple[Path, list[ListedImage]]:
     """Read the lists of training and test images: the camera's center, and the rotation of cam_from_world. Focal
     lengths are those of the structure from motion, if it is there.
     """
@@ -219,7 +219,7 @@ def _cambridge(folder: Path) -> tuple[Path, list[Photograph]]:
                 focals[Path(words[0]).with_suffix("").as_posix()] = float(words[1])
             elif len(words) == 1 and focals:
                 break  # points follow
-    usual, images = float(np.median([*focals.values()])) if focals else np.nan, list[Photograph]()
+    usual, images = float(np.median([*focals.values()])) if focals else np.nan, list[ListedImage]()
     for file, split in (("dataset_train.txt", "map"), ("dataset_test.txt", "query")):
         for where, (name, *words) in lines_of(folder / file):
             if len(words) != 7 or not re.search(r"\.\w+$", name):
@@ -235,36 +235,36 @@ def _cambridge(folder: Path) -> tuple[Path, list[Photograph]]:
                 focal = focal if np.isfinite(focal) else 1670.0 * max(size) / 1920  # that of the phone, as often used
                 width, height = size
                 camera = camera_at(where, f"SIMPLE_PINHOLE, {width}, {height}, {focal}, {width / 2}, {height / 2}")
-            images.append(Photograph(name, split, camera, make_pose(rotation, center)))
+            images.append(ListedImage(name, split, camera, make_pose(rotation, center)))
     return folder, images
 
 
-def _aachen(folder: Path) -> tuple[Path, list[Photograph]]:
+def _aachen(folder: Path) -> tuple[Path, list[ListedImage]]:
     model = read_model(_first(folder.glob("3D-models/**/images.bin"), folder, "3D-models/*/images.bin").parent)
     choices = (folder / "images_upright", folder / "images" / "images_upright")
     root = _first(filter(Path.is_dir, choices), folder, "images_upright")
     images = _of_model(model, "map")
     for path in sorted(folder.glob("queries/*_with_intrinsics.txt")):
         for where, (name, *words) in lines_of(path):
-            images.append(Photograph(name, "query", camera_at(where, ", ".join(words)), None))
+            images.append(ListedImage(name, "query", camera_at(where, ", ".join(words)), None))
     return root, images
 
 
-def _eth3d(folder: Path) -> tuple[Path, list[Photograph]]:
+def _eth3d(folder: Path) -> tuple[Path, list[ListedImage]]:
     model = read_model(folder / "dslr_calibration_undistorted")
     return folder / "images", _of_model(model, "")
 
 
-def _of_model(model: ColmapModel, split: str) -> list[Photograph]:
+def _of_model(model: ColmapModel, split: str) -> list[ListedImage]:
     """Return the images of a COLMAP model."""
     images = []
     for image in model.images.values():
         camera, pose = model.cameras.get(image.camera_id, "its camera is not in the model"), image.cam_from_world
-        images.append(Photograph(image.name, split, camera, pose if isinstance(pose, str) else inverse(pose)))
+        images.append(ListedImage(image.name, split, camera, pose if isinstance(pose, str) else inverse(pose)))
     return images
 
 
-def _tum(folder: Path) -> tuple[Path, list[Photograph]]:
+def _tum(folder: Path) -> tuple[Path, list[ListedImage]]:
     kind = next((name for name in _TUM if name in folder.resolve().name), None)
     if kind is None:
         expected = f"a name with {', '.join(_TUM)}, which tells the camera"
@@ -273,11 +273,11 @@ def _tum(folder: Path) -> tuple[Path, list[Photograph]]:
     pose_at, images = _nearest_pose(folder / "groundtruth.txt", "s"), []
     for where, words in lines_of(folder / "rgb.txt"):
         time_us = round(float(numbers_of(where, words, 1)[0]) * 1e6)
-        images.append(Photograph(words[1], "", camera, pose_at(time_us), time_us))
+        images.append(ListedImage(words[1], "", camera, pose_at(time_us), time_us))
     return folder, images
 
 
-def _kitti(folder: Path) -> tuple[Path, list[Photograph]]:
+def _kitti(folder: Path) -> tuple[Path, list[ListedImage]]:
     """Read a sequence, `sequences/<NN>`, with its poses in `poses/<NN>.txt`: world_from_cam of the left gray camera."""
     truth = folder.parents[1] / "poses" / f"{folder.resolve().name}.txt"
     track = read_track(truth, "s")
@@ -302,11 +302,11 @@ def _kitti(folder: Path) -> tuple[Path, list[Photograph]]:
         known = known and bool(np.isfinite(poses[row]).all())
         pose = poses[row] @ invert(cam_from_gray) if known else f"not in {truth}"
         name, time_us = file.relative_to(folder).as_posix(), round(times[row] * 1e6) if known else None
-        images.append(Photograph(name, "", camera, pose, time_us))
+        images.append(ListedImage(name, "", camera, pose, time_us))
     return folder, images
 
 
-def _euroc(folder: Path) -> tuple[Path, list[Photograph]]:
+def _euroc(folder: Path) -> tuple[Path, list[ListedImage]]:
     """Read the left camera of a recording, with the true poses of the vehicle's body."""
     cam0 = folder / "mav0" / "cam0"
     try:
@@ -323,7 +323,7 @@ def _euroc(folder: Path) -> tuple[Path, list[Photograph]]:
         time_us = int(words[0]) // 1000
         body = body_at(time_us)
         pose = body if isinstance(body, str) else body @ body_from_cam
-        images.append(Photograph(f"data/{words[1]}", "", camera, pose, time_us))
+        images.append(ListedImage(f"data/{words[1]}", "", camera, pose, time_us))
     return cam0, images
 
 

@@ -23,14 +23,14 @@ from toolkit.models.weights import MEGALOC, find_weights
 
 
 class Embedder(Protocol):
-    """Interface of a global descriptor, as the embed stage and the localizer of single photographs use it."""
+    """Interface of a global descriptor, as the embed stage and the localizer of single images use it."""
 
     name: str
     inputs: Literal["images", "features"]
     """Input of `embed`: images (H, W, 3) uint8 RGB, or `toolkit.features.features.LocalFeatures`."""
     upright: bool
-    """Whether it was trained on upright photographs, so that images should be turned upright for it."""
-    least_side: int | None
+    """Whether it was trained on upright images, so that images should be turned upright for it."""
+    min_side: int | None
     """Pixels that the shorter side of an image must keep; larger images may be decoded smaller, see `read_image`. None:
     always decode at full size."""
 

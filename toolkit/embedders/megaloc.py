@@ -1,4 +1,4 @@
-"""MegaLoc as an embedder: resizes photographs of any size and embeds them in batches, on any device."""
+"""MegaLoc as an embedder: resizes images of any size and embeds them in batches, on any device."""
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -48,7 +48,7 @@ class MegaLocEmbedder(Remade):
         self._size = image_size
         # Images may be decoded at twice the network's size, as Pillow does for thumbnails. The cosines to descriptors
         # of fully decoded images are then above 1 - 1e-4, the error of bfloat16; at the network's size, 1 - 1e-3.
-        self.least_side = 2 * image_size
+        self.min_side = 2 * image_size
         self._device = resolve_device(device)
         self._dtype = resolve_precision(dtype_compute, self._device)
         weights: Path | Mapping[str, Tensor] | MegaLoc = given_or_resolved(MEGALOC, checkpoint)
@@ -62,7 +62,7 @@ class MegaLocEmbedder(Remade):
 
     @property
     def settings(self) -> dict[str, Any]:
-        sizes = {"image_size": self._size, "least_side": self.least_side}
+        sizes = {"image_size": self._size, "least_side": self.min_side}
         precision = str(self._dtype).removeprefix("torch.")
         return {"name": self.name, "weights": self._weights, **sizes, "dtype_compute": precision}
 

@@ -57,7 +57,7 @@ class Vlad:
     name = "vlad"
     inputs: Literal["features"] = "features"
     upright = False
-    least_side = None
+    min_side = None
 
     def __init__(self, arrays: dict[str, Floats], fingerprint: str = ""):
         self._fingerprint = fingerprint

@@ -79,8 +79,8 @@ READ_SUFFIXES = (*IMAGE_SUFFIXES, ".webp", ".tif", ".tiff", ".bmp", ".jp2")
 HEIC_SUFFIXES = (".heic", ".heif")
 CONVERTED_SUFFIXES = (*READ_SUFFIXES[len(IMAGE_SUFFIXES) :], *HEIC_SUFFIXES, ".gif", ".avif")
 """Formats that a reconstruction converts to PNG; HEIC needs the package pillow-heif."""
-PHOTOGRAPHS = (*IMAGE_SUFFIXES, *CONVERTED_SUFFIXES, ".dng", ".cr2", ".nef", ".arw")
-"""Formats of photographs, read or not."""
+KNOWN_SUFFIXES = (*IMAGE_SUFFIXES, *CONVERTED_SUFFIXES, ".dng", ".cr2", ".nef", ".arw")
+"""Formats of images, read or not."""
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 PLACING = ("link", "copy")
 EXIF = "exif"
@@ -95,7 +95,7 @@ AXES = {"opencv": np.eye(4), "opengl": np.diag([1.0, -1.0, -1.0, 1.0])}
 """named_from_cam (4, 4) for each named convention of camera axes: `opencv`, the toolkit's own, has x right, y down, z
 forward; `opengl` has x right, y up, z backward."""
 _AXES = {"opencv": "camera x right, y down, z forward", "opengl": "camera x right, y up, z backward"}
-_MOST_FOR_UP = 300  # cameras that tell what is up
+_MAX_FOR_UP = 300  # cameras that tell what is up
 
 
 @dataclass(kw_only=True)
@@ -490,7 +490,7 @@ class Draft(Options):
             self.rows.append(dict(zip(columns, (image.name, "imported", *values), strict=True)))
         self.rows = [row | {"image": printable(row["image"]), "status": printable(row["status"])} for row in self.rows]
         table = pd.DataFrame(self.rows, columns=columns).astype({"timestamp": "Int64"})
-        posed = list(self._camera_poses(self.images[:: max(1, len(self.images) // _MOST_FOR_UP)]).values())
+        posed = list(self._camera_poses(self.images[:: max(1, len(self.images) // _MAX_FOR_UP)]).values())
         axis = ", ".join(f"{value + 0.0:.2f}" for value in up_of_cameras(posed))
         how = "a guess: all look along -z" if look_down_z(np.reshape(posed, (-1, 4, 4))) else "as most cameras are held"
         by = f"z, {self.record['up']}" if "up" in self.record else f"({axis}), {how}"
@@ -751,7 +751,7 @@ def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES, draft:
     names = [name for name in names if name not in set(broken)] if broken else names
     others = {"its name is not UTF-8: rename it": broken} if broken else {}
     for name in files:
-        if (suffix := name[name.rfind(".") :].lower()) in PHOTOGRAPHS and suffix not in suffixes:
+        if (suffix := name[name.rfind(".") :].lower()) in KNOWN_SUFFIXES and suffix not in suffixes:
             how = HEIC_HOW if suffix in HEIC_SUFFIXES else CONVERT
             others.setdefault(f"{suffix} is not read: {how}", []).append(name)
     note = [f"captures in the folder of images are skipped: {', '.join(captures[:3])}"] if captures else []
@@ -787,7 +787,7 @@ def walk_files(folder: Path) -> tuple[list[str], list[str]]:
 
 
 def write_png(source: Path, target: Path) -> None:
-    """Write a photograph in another format as PNG with its EXIF tags. Raise `images.HEADER_ERRORS` if it is none."""
+    """Write an image in another format as PNG with its EXIF tags. Raise `images.HEADER_ERRORS` if it is none."""
     with PIL.Image.open(source) as image:
         pixels, exif = image.convert("RGB"), image.getexif()  # in this order: Pillow turns a TIFF upright
     pixels.save(target, "PNG", exif=exif)
@@ -816,7 +816,7 @@ def _composed(name: str) -> str:
 def _loose(name: str) -> str:
     name = _composed(name).replace("\\", "/").casefold()
     stem, dot, suffix = name.rpartition(".")
-    return stem if f"{dot}{suffix}" in PHOTOGRAPHS else name
+    return stem if f"{dot}{suffix}" in KNOWN_SUFFIXES else name
 
 
 def _is_mask(name: str) -> bool:

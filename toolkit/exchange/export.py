@@ -1,6 +1,6 @@
 """Export for other tools: a COLMAP model of the map; retrieval, poses and intrinsics as hloc lists; a table of poses;
 local features and matches in the HDF5 files of hloc (https://github.com/cvg/Hierarchical-Localization), which are also
-imported; results on the Earth: tables for maps and GIS, and position and direction in the EXIF tags of the pictures.
+imported; results on the Earth: tables for maps and GIS, and position and direction in the EXIF tags of the images.
 
 `names="own"` gives images the names that the user knows (`files.own_name`): an imported image has its path in the
 folder it was imported from, other images have their path relative to the capture's folder `sessions`. With
@@ -551,15 +551,15 @@ def export_geo(run: str | Path, out: str | Path, capture: str | Path | None = No
 def export_exif(
     run: str | Path, out: str | Path, capture: str | Path | None = None, unsure: bool = False, xmp: bool = False
 ) -> int:  # fmt: skip
-    """Write copies of the query pictures with position and direction in EXIF; the pixels of JPEGs stay byte for byte.
+    """Write copies of the query images with position and direction in EXIF; the pixels of JPEGs stay byte for byte.
 
-    With `xmp`, write XMP files with these tags instead, `a.xmp` of `a.jpg`, to lie beside the pictures. Of a picture
+    With `xmp`, write XMP files with these tags instead, `a.xmp` of `a.jpg`, to lie beside the images. Of an image
     that was localized in several maps, the pose with the most inliers, then the surest, is taken; with `unsure`, also
-    one of low confidence. Times and other tags stay. Return the number of pictures.
+    one of low confidence. Times and other tags stay. Return the number of images.
 
     Raises:
         ManifestError: the folder `out` contains files; or two XMP files would have one name.
-        ImageError: a picture cannot be read; and as for `geo_table`.
+        ImageError: an image cannot be read; and as for `geo_table`.
     """
     out = Path(out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -597,7 +597,7 @@ def _degrees(value: float) -> tuple[int, int, float]:
 
 
 def _write_with_gps(source: Path, target: Path, row: Mapping[Any, Any]) -> None:
-    """Write a copy of a picture with other GPS tags."""
+    """Write a copy of an image with other GPS tags."""
     try:
         with PIL.Image.open(source) as image:
             exif, kind, jpeg = image.getexif(), image.format, source.read_bytes()
@@ -615,7 +615,7 @@ def _write_with_gps(source: Path, target: Path, row: Mapping[Any, Any]) -> None:
             if math.isfinite(row["position_std_m"]):
                 tags[31] = round(row["position_std_m"], 4)
             exif[_GPS] = tags
-            if not jpeg.startswith(b"\xff\xd8"):  # of a JPEG with several pictures, Pillow says MPO
+            if not jpeg.startswith(b"\xff\xd8"):  # of a JPEG with several images, Pillow says MPO
                 image.save(target, format=kind, exif=exif, icc_profile=image.info.get("icc_profile"))
                 return
         content = _EXIF_HEAD + exif.tobytes().removeprefix(_EXIF_HEAD)

@@ -31,11 +31,11 @@ RECORD = "proc/reconstruction.json"
 GEO_COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "heading_deg", "pitch_deg")
 _EARTH_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84
 _SQUARE = _FLATTENING * (2 - _FLATTENING)  # squared eccentricity
-_LEAST_HORIZONTAL = 1e-3  # smallest horizontal part of an optical axis that has a heading
+_MIN_HORIZONTAL = 1e-3  # smallest horizontal part of an optical axis that has a heading
 GPS = "GPS in EXIF"
 PRIOR = "rough poses"
 PRIOR_NOISE_M = 0.05  # expected noise of a rough position; within a small factor, the data decide
-MOST_ALIGNED = 60  # images by which a model is aligned to rough poses
+MAX_ALIGNED = 60  # images by which a model is aligned to rough poses
 _GPS_TAGS = 0x8825  # number of the EXIF tag
 
 
@@ -114,7 +114,7 @@ def _place_by_poses(
 ) -> Placing:  # fmt: skip
     """Transform a model to the world of rough poses; orientations tell up, also where positions are on a line."""
     every = sorted(name for name in images if name in prior)
-    names = every[:: -(-len(every) // MOST_ALIGNED) or 1]
+    names = every[:: -(-len(every) // MAX_ALIGNED) or 1]
     if not names:
         return Placing(None, record, [f"{PRIOR}: none of a photograph in the model"])
     ours = np.stack([_upright(images[name], 0) for name in names])
@@ -303,7 +303,7 @@ def geographic_poses(world_from_cams: Floats, origin: Floats) -> Floats:
     # From the frame at the origin to that at each camera, where north has another direction.
     east, north, up = np.einsum("nij,kj,nk->in", axes, _local_axes(origin), world_from_cams[:, :3, 2])
     heading = np.degrees(np.arctan2(east, north)) % 360
-    heading[np.hypot(east, north) < _LEAST_HORIZONTAL] = np.nan
+    heading[np.hypot(east, north) < _MIN_HORIZONTAL] = np.nan
     return np.column_stack([geo, heading, np.degrees(np.arcsin(np.clip(up, -1, 1)))])
 
 

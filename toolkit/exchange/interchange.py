@@ -762,7 +762,7 @@ def import_panoramas(
 ) -> ImportReport:  # fmt: skip
     """Make a session of equirectangular panoramas: a map with poses, or queries, whose poses become ground truth.
 
-    The frame of a panorama is that of COLMAP's EQUIRECTANGULAR: z points to the center of the picture, x to the right,
+    The frame of a panorama is that of COLMAP's EQUIRECTANGULAR: z points to the center of the image, x to the right,
     y down. It is the frame of the rig, so the pose of a query is that of its panorama. The ground and the sky more than
     45 degrees from the horizon are left out. A mask of a panorama is cut as well, see `images.find_mask`. Raise
     CaptureError for a malformed table, a map without poses, two panoramas of one name, the session exists already, or
@@ -830,7 +830,7 @@ def _rig_from_views() -> Iterator[tuple[int, Floats]]:
 def _cut(path: Path, out: Path, masks: Path | None) -> int:
     """Write the views of a panorama, and of its mask, to a folder; return their side in pixels.
 
-    Raise ImageError if the picture or its mask cannot be read, or does not show the whole sphere.
+    Raise ImageError if the image or its mask cannot be read, or does not show the whole sphere.
     """
     pixels = read_image(path)
     height, width = pixels.shape[:2]

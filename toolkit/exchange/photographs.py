@@ -1,5 +1,5 @@
-"""Gather photographs for a reconstruction: files, folders and frames of videos, with what their EXIF tags tell; and
-rigs: photographs with equal names in several folders, taken at the same time.
+"""Gather images for a reconstruction: files, folders and frames of videos, with what their EXIF tags tell; and
+rigs: images with equal names in several folders, taken at the same time.
 """
 
 from collections import Counter
@@ -39,18 +39,18 @@ from toolkit.files import write_atomic
 from toolkit.scene.query import FOCAL_PRIOR
 
 TAKEN_SUFFIXES = (*IMAGE_SUFFIXES, *CONVERTED_SUFFIXES, *VIDEO_SUFFIXES)
-"""Formats of which photographs are made."""
+"""Formats of which images are made."""
 STEP = 0.06  # motion of the image between chosen frames of a video, in multiples of its width
 _SMALL = 320  # width of the frames whose motion is measured, pixels
 FOLDERS = "folders"
-"""What is given instead of a file if all folders with photographs are the cameras of one rig."""
+"""What is given instead of a file if all folders with images are the cameras of one rig."""
 Prefixes = list[list[str]]
-"""For each rig, how the names of the photographs of each camera begin; the reference camera is the first."""
+"""For each rig, how the names of the images of each camera begin; the reference camera is the first."""
 
 
 @dataclass(frozen=True)
-class Photograph:
-    """A photograph of a reconstruction."""
+class SourceImage:
+    """An image of a reconstruction."""
 
     name: str  # relative path that it gets in the capture
     path: Path  # the JPEG or PNG file
@@ -66,30 +66,30 @@ class Photograph:
 
 def gather(
     sources: Sequence[Path], made: Path, fps: float | None = None, masks: Path | None = None, prefixed: bool = False
-) -> tuple[list[Photograph], dict[str, str]]:
-    """Return the photographs of files, folders and videos, and the reason for each that cannot be read, by name.
+) -> tuple[list[SourceImage], dict[str, str]]:
+    """Return the images of files, folders and videos, and the reason for each that cannot be read, by name.
 
     Names are paths in the source. If there are several sources, or with `prefixed`, the source's name comes first.
 
-    Frames of videos, and photographs in other formats than JPEG and PNG, are written to the folder `made`, once. For
+    Frames of videos, and images in other formats than JPEG and PNG, are written to the folder `made`, once. For
     `masks` see `images.find_mask`. Raise CaptureError if a source is missing or is no image or video, or two
-    photographs would have one name.
+    images would have one name.
     """
-    photographs, unreadable = list[Photograph](), dict[str, str]()
+    items, unreadable = list[SourceImage](), dict[str, str]()
     for name, source in _files(sources, made, fps, prefixed or len(sources) > 1):
         try:
             name, path = _converted(name, source, made)
             _, exif = read_header(path)
-            photographs.append(Photograph(name, path, exif, gps_position(path), find_mask(source, masks)))
+            items.append(SourceImage(name, path, exif, gps_position(path), find_mask(source, masks)))
         except ImageError as error:
             unreadable[name] = str(error)
-    twice = {item.name for item in photographs}
-    if len(twice) < len(photographs):
+    twice = {item.name for item in items}
+    if len(twice) < len(items):
         raise CaptureError(f"{', '.join(map(str, sources))}: two photographs have one name. Rename a file or folder.")
-    if masks is not None and photographs and not any(item.mask for item in photographs):
-        name = photographs[0].name
+    if masks is not None and items and not any(item.mask for item in items):
+        name = items[0].name
         raise CaptureError(f"{masks}: no mask of a photograph in it. Expected that of {name} as {name}.png.")
-    return photographs, unreadable
+    return items, unreadable
 
 
 def _files(sources: Sequence[Path], made: Path, fps: float | None, prefixed: bool) -> Iterator[tuple[str, Path]]:
@@ -99,7 +99,7 @@ def _files(sources: Sequence[Path], made: Path, fps: float | None, prefixed: boo
         if source.is_dir():
             for name in list_images(source, TAKEN_SUFFIXES):
                 if (source / name).absolute().is_relative_to(made.absolute().parents[1]):
-                    continue  # the capture is in the folder of the photographs, from a command that was stopped
+                    continue  # the capture is in the folder of the images, from a command that was stopped
                 if name.lower().endswith(VIDEO_SUFFIXES):
                     video = Path(name).with_suffix("").as_posix()
                     yield from _frames(source / name, made, f"{prefix}{video}/", fps)
@@ -199,24 +199,24 @@ def _motion(before: NDArray[np.uint8], now: NDArray[np.uint8]) -> float:
 
 
 def initial_cameras(
-    photographs: Iterable[Photograph], known: Mapping[str, pycolmap.Camera], rigs: Sequence[Sequence[str]] = ()
+    items: Iterable[SourceImage], known: Mapping[str, pycolmap.Camera], rigs: Sequence[Sequence[str]] = ()
 ) -> tuple[list[int], list[pycolmap.Camera]]:
-    """Return for each photograph the number of its camera, and the cameras before they are estimated.
+    """Return for each image the number of its camera, and the cameras before they are estimated.
 
-    Photographs with equal `known` intrinsics, by name, share a camera; of the others, those of one folder with one
+    Images with equal `known` intrinsics, by name, share a camera; of the others, those of one folder with one
     size, make, model and focal length in EXIF. Without these tags, they do so only if all in the folder have one size,
     as those that a person collected have several. Those whose names begin with one of the prefixes of `rigs` share one.
 
     Raises:
-        CaptureError: the photographs of a camera of a rig have several sizes or known intrinsics.
+        CaptureError: the images of a camera of a rig have several sizes or known intrinsics.
     """
-    photographs = list(photographs)
-    sizes = [read_header(item.path)[0] for item in photographs]
-    folders = [Path(item.name).parent for item in photographs]
+    items = list(items)
+    sizes = [read_header(item.path)[0] for item in items]
+    folders = [Path(item.name).parent for item in items]
     different = Counter(folder for folder, _ in {*zip(folders, sizes, strict=True)})
     keys, of_prefix = dict[Any, int](), dict[str, Any]()
     numbers, cameras = list[int](), list[pycolmap.Camera]()
-    for index, (item, size, folder) in enumerate(zip(photographs, sizes, folders, strict=True)):
+    for index, (item, size, folder) in enumerate(zip(items, sizes, folders, strict=True)):
         tags = exif_key(item.exif)
         given = known.get(item.name)
         alone = index if different[folder] > 2 and not any(tags) else None
@@ -247,16 +247,16 @@ def _initial(path: Path, size: tuple[int, int]) -> pycolmap.Camera:
 # Rigs
 
 
-def read_rigs(rig: str | Path, photographs: Sequence[Photograph]) -> Prefixes:
+def read_rigs(rig: str | Path, items: Sequence[SourceImage]) -> Prefixes:
     """Return the rigs of `FOLDERS`, or of a file in COLMAP's format `rig_config.json`.
 
     Poses of cameras in the rig are not taken from the file, but found.
 
     Raises:
-        CaptureError: the file cannot be read, or a rig does not have two cameras, each with photographs.
+        CaptureError: the file cannot be read, or a rig does not have two cameras, each with images.
     """
     if str(rig) == FOLDERS:
-        found = [sorted({f"{Path(item.name).parent.as_posix()}/" for item in photographs})]
+        found = [sorted({f"{Path(item.name).parent.as_posix()}/" for item in items})]
     else:
         try:
             configs = pycolmap.read_rig_config(rig)
@@ -265,9 +265,9 @@ def read_rigs(rig: str | Path, photographs: Sequence[Photograph]) -> Prefixes:
         cameras = [sorted(config.cameras, key=lambda camera: not camera.ref_sensor) for config in configs]
         found = [[camera.image_prefix for camera in each] for each in cameras]
     for prefixes in found:
-        counts = {prefix: sum(item.name.startswith(prefix) for item in photographs) for prefix in prefixes}
+        counts = {prefix: sum(item.name.startswith(prefix) for item in items) for prefix in prefixes}
         if len(prefixes) < 2 or not all(counts.values()):
-            example = photographs[0].name
+            example = items[0].name
             expected = "two cameras or more, each with photographs in its folder"
             raise CaptureError(f"rig: {rig}: found {counts}, expected {expected}. A photograph: {example}.")
     return found

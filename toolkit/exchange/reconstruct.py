@@ -1,4 +1,4 @@
-"""Reconstruct the poses of photographs: structure from motion with the toolkit's features and COLMAP's mapper; and let
+"""Reconstruct the poses of images: structure from motion with the toolkit's features and COLMAP's mapper; and let
 a reconstructed map grow: add a recording to it, whose poses are found in the model, or remove one.
 
 The work is in `CAPTURE/reconstruction/`: features and matches, which a stopped reconstruction finds again, COLMAP's
@@ -37,7 +37,7 @@ from toolkit.exchange.drafts import AXES, SUBSESSION, Draft, DraftImage, every_n
 from toolkit.exchange.georeference import RECORD, place, read_positions
 from toolkit.exchange.import_report import ImportReport
 from toolkit.exchange.interchange import once, read_intrinsics, read_poses
-from toolkit.exchange.photographs import TAKEN_SUFFIXES, Photograph, Prefixes, gather, initial_cameras, join, read_rigs
+from toolkit.exchange.photographs import TAKEN_SUFFIXES, Prefixes, SourceImage, gather, initial_cameras, join, read_rigs
 from toolkit.features.features import KINDS, LocalFeatures, MutualMatcher, PairMatches, SiftExtractor, unit_descriptors
 from toolkit.features.matching import LocalMethod, create_local_methods, epipolar_matches, resolve_auto
 from toolkit.features.stores import FeatureStore, extract_session, match_sessions
@@ -56,27 +56,27 @@ from toolkit.files import (
 from toolkit.geometry import Floats, Ints, unit
 from toolkit.manifest import LocalizeSettings, SiftSettings
 from toolkit.scene.query import FOCAL_PRIOR
-from toolkit.store.items import Items, heals
+from toolkit.store.items import Items, retry_damaged
 from toolkit.threads import one_thread
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
 FOLDER = "reconstruction"
 UNIT_HINT = "If you know a length, give --distance or --positions, or photographs with GPS"
-ALL_PAIRS = 60  # up to this number of photographs, all pairs are matched
-NEIGHBORS, SIMILAR = 10, 20  # else each photograph with so many next ones in its folder, and so many that look similar
+ALL_PAIRS = 60  # up to this number of images, all pairs are matched
+NEIGHBORS, SIMILAR = 10, 20  # else each image with so many next ones in its folder, and so many that look similar
 MIN_VERIFIED = 15  # of a pair that counts
-MIN_MODEL = 3  # photographs of a model
-ESCALATED = 6  # similar ones of each photograph that SIFT leaves out, with which learned features are tried
+MIN_MODEL = 3  # images of a model
+ESCALATED = 6  # similar ones of each image that SIFT leaves out, with which learned features are tried
 START = f"{FOCAL_PRIOR} times the longer side"  # a focal length that nothing tells
 RATIO = 0.8  # of SIFT's matches; fewer of them are wrong than with the larger one for queries
 LOSS_PX, MAX_ERROR_PX, MIN_ANGLE_DEG = 0.5, 4.0, 1.5
 """Of the last bundle adjustment: scale of the Cauchy loss and largest error of an observation, in pixels of the image
 where features are detected, and smallest triangulation angle."""
-FEW_PAIRS, STRONGEST = 100, 2048  # if there are more pairs, only so many SIFT features of each photograph are matched
+FEW_PAIRS, STRONGEST = 100, 2048  # if there are more pairs, only so many SIFT features of each image are matched
 MAPPED_NOISE_M = 0.2  # of the positions of rough poses in COLMAP's mapper, whose loss is robust; drift adds to noise
 MAX_VIEW_DEG = 60.0  # largest angle between the optical axes of images that are neighbors by rough poses
-MIN_POINTS = 30  # points of a photograph in a model; COLMAP requires as many when it estimates a pose
+MIN_POINTS = 30  # points of an image in a model; COLMAP requires as many when it estimates a pose
 _BATCH = 64  # pairs that are matched at once
 
 
@@ -87,7 +87,7 @@ class Reconstruction:
     report: ImportReport
     points: Floats  # (P, 3) in the world
     colors: NDArray[np.uint8]  # (P, 3) RGB
-    camera: str = ""  # option for queries of the same camera, if the photographs have one
+    camera: str = ""  # option for queries of the same camera, if the images have one
 
     @property
     def capture(self) -> Capture:
@@ -113,15 +113,15 @@ class _Mutual(MutualMatcher):
 
 
 class _Work:
-    """Photographs with features and verified matches, in the folder of the reconstruction."""
+    """Images with features and verified matches, in the folder of the reconstruction."""
 
     def __init__(
-        self, folder: Path, device: str, photographs: list[Photograph], known: Mapping[str, pycolmap.Camera],
+        self, folder: Path, device: str, items: list[SourceImage], known: Mapping[str, pycolmap.Camera],
         prior: Mapping[str, Floats] | None = None, rigs: Prefixes | None = None,
     ) -> None:  # fmt: skip
-        self.folder, self.photographs, self.rigs = folder, photographs, rigs or []
-        self.camera_of, self.cameras = initial_cameras(photographs, known, self.rigs)
-        self.known = {number for number, item in zip(self.camera_of, photographs, strict=True) if item.name in known}
+        self.folder, self.items, self.rigs = folder, items, rigs or []
+        self.camera_of, self.cameras = initial_cameras(items, known, self.rigs)
+        self.known = {number for number, item in zip(self.camera_of, items, strict=True) if item.name in known}
         """Numbers of the cameras whose intrinsics stay as they are."""
         self.exif_px = {number: camera.params[0] for number, camera in enumerate(self.cameras)
                         if camera.has_prior_focal_length and number not in self.known}  # fmt: skip
@@ -129,24 +129,24 @@ class _Work:
         self.exif_used = True
         session = folder / "sessions" / f"{device}_map"
         shutil.rmtree(session, ignore_errors=True)
-        draft = Draft(session, folder, sources={item.name: item.path for item in photographs})
-        for item, number in zip(photographs, self.camera_of, strict=True):
+        draft = Draft(session, folder, sources={item.name: item.path for item in items})
+        for item, number in zip(items, self.camera_of, strict=True):
             draft.images.append(
                 DraftImage(item.name, self.cameras[number], f"{SUBSESSION}/cam_{number + 1}", item.name)
             )
-        draft.mask_files = {item.name: item.mask for item in photographs if item.mask is not None}
+        draft.mask_files = {item.name: item.mask for item in items if item.mask is not None}
         draft.leave_out()
         self.unusable = {row["image"]: row["status"] for row in draft.rows}
         draft.write()
         self.session = Session.open(session)
-        index = {item.name: number for number, item in enumerate(photographs)}
-        self.photograph_of = [index[name.partition(IMPORTED)[2]] for name in self.session.image_names]
-        order = np.argsort(self.photograph_of)
+        index = {item.name: number for number, item in enumerate(items)}
+        self.item_of = [index[name.partition(IMPORTED)[2]] for name in self.session.image_names]
+        order = np.argsort(self.item_of)
         self.names = [self.session.image_names[row] for row in order]
-        """Names of the images in the stores, in the order of the photographs."""
-        self.photographs = [photographs[self.photograph_of[row]] for row in order]
-        self.camera_of = [self.camera_of[self.photograph_of[row]] for row in order]
-        self.prior = np.stack([(prior or {}).get(item.name, np.full((4, 4), np.nan)) for item in self.photographs])
+        """Names of the images in the stores, in the order of `items`."""
+        self.items = [items[self.item_of[row]] for row in order]
+        self.camera_of = [self.camera_of[self.item_of[row]] for row in order]
+        self.prior = np.stack([(prior or {}).get(item.name, np.full((4, 4), np.nan)) for item in self.items])
         """Rough world_from_cam (N, 4, 4), meters; NaN where there is none."""
         self.kinds: list[tuple[LocalMethod, FeatureStore]] = []
         self.pairs: list[dict[tuple[int, int], Ints]] = []
@@ -165,7 +165,7 @@ class _Work:
     def extract(self, method: LocalMethod, images: Sequence[int]) -> None:
         rows = np.array([self.session.row_of_name[self.names[image]] for image in images])
         turns = np.zeros(len(self.session.images), np.int64)
-        turns[rows] = [self.photographs[image].quarter_turns for image in images]
+        turns[rows] = [self.items[image].quarter_turns for image in images]
         store = extract_session(
             self.session, self.folder / "features", method.extractor, rows, default_workers(), turns=turns
         )
@@ -200,7 +200,7 @@ class _Work:
         count = len(self)
         if count <= ALL_PAIRS:
             return [*combinations(range(count), 2)]
-        folders = [Path(item.name).parent for item in self.photographs]
+        folders = [Path(item.name).parent for item in self.items]
         near = (range(i + 1, min(i + 1 + NEIGHBORS, count)) for i in range(count))
         pairs = {(i, j) for i, others in enumerate(near) for j in others if folders[i] == folders[j]}
         for i, similar in enumerate(np.argsort(-self.similarity, axis=1, kind="stable")[:, :SIMILAR].tolist()):
@@ -329,7 +329,7 @@ class _Work:
         return models
 
     def _models(self, mapper: str) -> list[pycolmap.Reconstruction]:
-        """Return the models, the largest first; of the others, those that have a photograph that it lacks."""
+        """Return the models, the largest first; of the others, those that have an image that it lacks."""
         database, out = self.write_database(), self.folder / "models"
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
@@ -350,7 +350,7 @@ class _Work:
             for model in tqdm(kept, "refine", unit="model"):
                 self._refine(model)
             if self.rigs and kept:
-                join(kept[0], database, self.rigs, self.names[0].removesuffix(self.photographs[0].name))
+                join(kept[0], database, self.rigs, self.names[0].removesuffix(self.items[0].name))
                 self._refine(kept[0])
         return [model for model in kept if model.num_reg_images() >= MIN_MODEL]
 
@@ -427,36 +427,36 @@ def _quiet() -> Iterator[None]:
         pycolmap.logging.minloglevel = level
 
 
-@heals
+@retry_damaged
 def reconstruct(
     sources: Sequence[str | Path], capture: str | Path, device: str = "ios", fps: float | None = None,
     camera: str | None = None, distance: tuple[str, str, float] | None = None, mapper: str = "incremental",
     table: str | Path | None = None, poses_prior: str | Path | None = None,
     rig: str | Path | None = None, **options: Any,
 ) -> Reconstruction:  # fmt: skip
-    """Make a map session from photographs without poses, and with `hold_out` a query session with ground truth.
+    """Make a map session from images without poses, and with `hold_out` a query session with ground truth.
 
     Args:
         sources: image files, folders of images and videos.
         capture: folder of the capture; created if it does not exist.
         device: the sessions are `<device>_map` and `<device>_query`.
         fps: frames per second of videos; None: chosen by motion.
-        camera: intrinsics of all photographs, `MODEL, width, height, parameter, ...`, kept as they are; None:
+        camera: intrinsics of all images, `MODEL, width, height, parameter, ...`, kept as they are; None:
             estimated, from EXIF if it has a focal length.
-        table: intrinsics of photographs, see `interchange.read_intrinsics`, kept as they are; those that are not in it
+        table: intrinsics of images, see `interchange.read_intrinsics`, kept as they are; those that are not in it
             have those of `camera`.
-        poses_prior: rough poses of photographs, a table as of `interchange.read_poses` in meters: world_from_cam of a
-            device's tracking, with the camera axes of the option `axes`. They tell which photographs are neighbors,
+        poses_prior: rough poses of images, a table as of `interchange.read_poses` in meters: world_from_cam of a
+            device's tracking, with the camera axes of the option `axes`. They tell which images are neighbors,
             and the world of the model.
         distance: two points, `IMAGE:x,y` in pixels, or images for the centers of their cameras, and the meters
             between.
         mapper: COLMAP's `incremental` or `global` mapper.
-        rig: `folders` if the folders are the cameras of one rig, whose photographs with equal names were taken at the
+        rig: `folders` if the folders are the cameras of one rig, whose images with equal names were taken at the
             same time, or COLMAP's rig_config.json, see `photographs.read_rigs`; each folder is one camera then.
         options: see `drafts.Options`; GPS in EXIF is used in any case.
 
     Raises:
-        CaptureError: no photograph, no two that fit together, a session that exists, or a malformed file.
+        CaptureError: no image, no two that fit together, a session that exists, or a malformed file.
         ManifestError: a malformed argument.
     """
     if mapper not in ("incremental", "global"):
@@ -468,7 +468,7 @@ def reconstruct(
         raise ManifestError("poses-prior: found together with distance or positions. Give one of them.")
     draft = start(capture, device, "map", folder, **options)
     masks = None if masks is None else Path(masks)
-    photographs, unreadable = gather(list(map(Path, sources)), folder / "images", fps, masks)
+    items, unreadable = gather(list(map(Path, sources)), folder / "images", fps, masks)
     known = read_positions(Path(positions)) if positions is not None else None
     given = None
     if camera is not None:
@@ -476,18 +476,18 @@ def reconstruct(
             given = parse_camera("camera", camera)
         except ValueError as error:
             raise ManifestError(f"camera: {error}") from None
-    if not photographs:
+    if not items:
         raise CaptureError(f"{sources[0]}: no photograph can be read. First: {next(iter(unreadable.items()))}")
-    cameras = dict.fromkeys((item.name for item in photographs), given) if given is not None else {}
-    tabled = _of_photographs(read_intrinsics(Path(table)), photographs, table) if table is not None else {}
+    cameras = dict.fromkeys((item.name for item in items), given) if given is not None else {}
+    tabled = _of_items(read_intrinsics(Path(table)), items, table) if table is not None else {}
     cameras |= tabled
     prior = read_poses(Path(poses_prior), "world_from_cam")[1] if poses_prior is not None else {}
     prior = {name: pose @ AXES[axes] for name, pose in prior.items()}
-    prior = _of_photographs(prior, photographs, poses_prior) if prior else prior
-    rigs = read_rigs(rig, photographs) if rig is not None else []
-    work = _Work(folder, device, photographs, cameras, prior, rigs)
+    prior = _of_items(prior, items, poses_prior) if prior else prior
+    rigs = read_rigs(rig, items) if rig is not None else []
+    work = _Work(folder, device, items, cameras, prior, rigs)
     draft.frames_are_names = not rigs
-    held = every_nth([item.name for item in work.photographs], draft.hold_out)
+    held = every_nth([item.name for item in work.items], draft.hold_out)
     work.unusable |= unreadable
     matcher = _Mutual(RATIO, shorten=KINDS["sift"].shorten)
     work.extract(LocalMethod("sift", SiftExtractor(), matcher), range(len(work)))
@@ -502,8 +502,8 @@ def reconstruct(
         worst = "; ".join(f"{name}: {reason}" for name, reason in list(_reasons(work, models).items())[:3])
         raise CaptureError(f"{sources[0]}: no two of {len(work)} photographs fit together. {worst}.")
     model = models[0]
-    geo = {item.name: item.geo for item in work.photographs if item.geo is not None}
-    placed = place(model, {item.name: item.quarter_turns for item in work.photographs}, geo, distance, known, prior)
+    geo = {item.name: item.geo for item in work.items if item.geo is not None}
+    placed = place(model, {item.name: item.quarter_turns for item in work.items}, geo, distance, known, prior)
     if placed.prior_noise_m is not None and not rigs:  # COLMAP's position priors are of single cameras
         work.hold_to_prior(model, placed.prior_noise_m)
     paths = [folder / "models" / str(number) for number in range(len(models))]
@@ -513,7 +513,7 @@ def reconstruct(
         each.write(str(path))
     sensors = {number: f"{SUBSESSION}/cam_{at}" for at, number in enumerate(sorted(model.cameras), start=1)}
     images = {image.name: image for image in model.images.values() if image.has_pose}
-    for name, item, number in zip(work.names, work.photographs, work.camera_of, strict=True):
+    for name, item, number in zip(work.names, work.items, work.camera_of, strict=True):
         if name in images:
             dropped = ", as the focal length in EXIF fits no model" if number in work.exif_px else ""
             origin = f"estimated, started at {'EXIF' if work.exif_used and dropped else START + dropped}"
@@ -523,7 +523,7 @@ def reconstruct(
     draft.rows += [{"image": name, "status": reason} for name, reason in _reasons(work, models).items()]
     sizes, error_px = [each.num_reg_images() for each in models], model.compute_mean_reprojection_error()
     record = {
-        "photographs": len(photographs) + len(unreadable), "registered": sizes[0], "other models": sizes[1:],
+        "photographs": len(items) + len(unreadable), "registered": sizes[0], "other models": sizes[1:],
         "mapper": mapper, "features": [method.name for method, _ in work.kinds],
         "points": model.num_points3D(), "track length": model.compute_mean_track_length(),
         "reprojection error, px": error_px, **placed.record,
@@ -548,18 +548,18 @@ def reconstruct(
     return Reconstruction(report, xyz.reshape(-1, 3), rgb.reshape(-1, 3), option)
 
 
-def _of_photographs(found: dict[str, T], photographs: Sequence[Photograph], table: object) -> dict[str, T]:
-    """Return what a table says of photographs, by their names; those that were converted have `.png` added."""
-    names = {name: item.name for item in photographs for name in (item.name.removesuffix(".png"), item.name)}
+def _of_items(found: dict[str, T], items: Sequence[SourceImage], table: object) -> dict[str, T]:
+    """Return what a table says of images, by their names; those that were converted have `.png` added."""
+    names = {name: item.name for item in items for name in (item.name.removesuffix(".png"), item.name)}
     kept = {names[name]: value for name, value in found.items() if name in names}
     if not kept:
-        first = f"found {next(iter(found), 'no image')!r}, expected {photographs[0].name!r}"
+        first = f"found {next(iter(found), 'no image')!r}, expected {items[0].name!r}"
         raise CaptureError(f"{table}: none of the photographs is in it: {first} and others.")
     return kept
 
 
-def add_posed(draft: Draft, item: Photograph, image: pycolmap.Image, sensor: str, origin: str) -> None:
-    """Add a photograph with its camera and pose in a model to a session."""
+def add_posed(draft: Draft, item: SourceImage, image: pycolmap.Image, sensor: str, origin: str) -> None:
+    """Add an image with its camera and pose in a model to a session."""
     draft.convention, draft.unit_hint = "found by structure from motion", UNIT_HINT
     assert image.camera is not None
     frame = image.frame
@@ -598,9 +598,9 @@ def reconstruct_once(
 
 
 def _escalate(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> list[str]:
-    """Match the photographs that are in no model with learned features, each with those that look similar.
+    """Match the images that are in no model with learned features, each with those that look similar.
 
-    These are matched with each other, too, where SIFT has: only points of two other photographs tell a pose.
+    These are matched with each other, too, where SIFT has: only points of two other images tell a pose.
     """
     inside = {image.name for model in models for image in model.images.values() if image.has_pose}
     left = [image for image, name in enumerate(work.names) if name not in inside and name in work.kinds[0][1]]
@@ -625,12 +625,12 @@ def _escalate(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> list[st
 
 
 def _reasons(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> dict[str, str]:
-    """Return why each photograph that is not in the largest model is left out, by name."""
+    """Return why each image that is not in the largest model is left out, by name."""
     numbered = reversed([*enumerate(models)])  # the largest comes last, and wins
     member = {image.name: number for number, model in numbered for image in model.images.values() if image.has_pose}
     shared, reasons = work.verified(), dict(work.unusable)
     inside = np.array([member.get(name) == 0 for name in work.names])
-    for image, (name, item) in enumerate(zip(work.names, work.photographs, strict=True)):
+    for image, (name, item) in enumerate(zip(work.names, work.items, strict=True)):
         if inside[image] or item.name in reasons:
             continue
         if name in member:
@@ -640,7 +640,7 @@ def _reasons(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> dict[str
             most = max((count for pair, count in work.matched.items() if image in pair), default=0)
             reason = f"no matches: at most {most} with another photograph, and these agree with no motion of the camera"
         elif not shared[image][inside].any():
-            count, other = np.count_nonzero(shared[image]), work.photographs[int(shared[image].argmax())].name
+            count, other = np.count_nonzero(shared[image]), work.items[int(shared[image].argmax())].name
             reason = f"not connected: matches {count} photographs, as {other}, none in the model"
         else:
             reason = f"no pose: its {shared[image][inside].max()} matches with the model's photographs agree with none"
@@ -666,18 +666,18 @@ def _hand_over(work: _Work, session: Path) -> None:
 # A map that grows
 
 
-@heals
+@retry_damaged
 def add_recording(
     sources: Sequence[str | Path], capture: str | Path, device: str = "ios", fps: float | None = None
 ) -> ImportReport:
-    """Register photographs into the model of a capture and add them to its map session, both made by `reconstruct`.
+    """Register images into the model of a capture and add them to its map session, both made by `reconstruct`.
 
     Raises:
-        CaptureError: the session was not reconstructed, all photographs are in it already, or none fits into its model.
+        CaptureError: the session was not reconstructed, all images are in it already, or none fits into its model.
     """
     folder, session = Path(capture) / FOLDER, Path(capture) / "sessions" / f"{device}_map"
     base = _model(folder, session)
-    old = _photographs(base, folder, session)
+    old = _items_of(base, folder, session)
     known = {item.path.resolve() for item in old.values()}
     gathered, unreadable = gather(list(map(Path, sources)), folder / "images", fps, prefixed=True)
     new = [item for item in gathered if item.path.resolve() not in known]
@@ -696,7 +696,7 @@ def add_recording(
     reasons = {name: why for name, why in _reasons(work, [model]).items() if name not in names} | unreadable
     if not added:
         raise CaptureError(f"{sources[0]}: no photograph fits into the model. {next(iter(reasons.items()))}.")
-    item_of = dict(zip(work.names, work.photographs, strict=True))
+    item_of = dict(zip(work.names, work.items, strict=True))
     draft = Draft(session, folder, add=True, record={"source": ", ".join(map(str, sources))})
     for image in sorted(added, key=lambda image: image.image_id):
         add_posed(draft, item_of[image.name], image, f"{image.camera_id}", "estimated with the model")
@@ -751,24 +751,24 @@ def _model(folder: Path, session: Path) -> pycolmap.Reconstruction:
     return model
 
 
-def _photographs(base: pycolmap.Reconstruction, folder: Path, session: Path) -> dict[int, Photograph]:
-    """Return the photographs of a model, with their masks, by the number of the image."""
-    photographs, sessions = {}, folder / "sessions"
+def _items_of(base: pycolmap.Reconstruction, folder: Path, session: Path) -> dict[int, SourceImage]:
+    """Return the images of a model, with their masks, by the number of the image."""
+    items, sessions = {}, folder / "sessions"
     for number in sorted(base.reg_image_ids()):
         name = base.image(number).name
         path, mask = (sessions / name).resolve(), session / MASKS / f"{IMPORTED}{own_name(name)}.png"
-        photographs[number] = Photograph(
+        items[number] = SourceImage(
             own_name(name), path, read_header(path)[1], None, mask.resolve() if mask.is_file() else None
         )
-    return photographs
+    return items
 
 
 def _keep_cameras(work: _Work, base: pycolmap.Reconstruction, number_of: dict[str, int]) -> None:
     """Give images of the model their numbers and cameras; start those of equal size and EXIF at the same intrinsics."""
-    fresh = [item for item in work.photographs if item.name not in number_of]
+    fresh = [item for item in work.items if item.name not in number_of]
     camera_of, cameras = initial_cameras(fresh, {})
     keys = {}
-    for item in work.photographs:
+    for item in work.items:
         if item.name in number_of:
             camera = base.cameras[base.image(number_of[item.name]).camera_id]
             keys[camera.width, camera.height, *exif_key(item.exif)] = camera
@@ -784,7 +784,7 @@ def _keep_cameras(work: _Work, base: pycolmap.Reconstruction, number_of: dict[st
     work.cameras = [base.cameras[number] for number in known] + cameras
     work.camera_ids = known + list(range(first, first + len(cameras)))
     left, work.camera_of, work.image_ids = iter(camera_of), [], []
-    for item in work.photographs:
+    for item in work.items:
         if item.name in number_of:
             work.image_ids.append(number_of[item.name])
             points = base.image(number_of[item.name]).points2D

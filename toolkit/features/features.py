@@ -72,7 +72,7 @@ _SIGMA = 1.6  # blur of the first level of an octave, pixels of the octave
 _BLURS = _SIGMA * 2 ** (np.arange(_INTERVALS + 3) / _INTERVALS)  # blur of each level of an octave, pixels of the octave
 _KERNEL_SIGMAS = 3.0  # radius of the blurring kernels, in units of their sigma
 _WHITE = 255 * 128  # white in the levels; rounding to integers usually moves a keypoint by less than 0.01 pixels
-_MOST_KEPT = 1 << 26  # values that a thread keeps for its next pyramid, 128 MB; 1280 x 960 pixels need 39 million
+_MAX_KEPT = 1 << 26  # values that a thread keeps for its next pyramid, 128 MB; 1280 x 960 pixels need 39 million
 _CAMERA_SIGMA = 0.5  # assumed blur of the input image, pixels of the image
 _BORDER = 5  # smallest distance of a keypoint from the border of an octave, pixels of the octave
 _EDGE_RATIO = 10.0  # largest ratio of the principal curvatures; keypoints with a larger one lie on an edge
@@ -336,7 +336,7 @@ class _Memory(threading.local):
 
     def take(self, count: int) -> _Levels:
         """Return an array of this length; it may share its memory with the last one."""
-        if count > _MOST_KEPT:
+        if count > _MAX_KEPT:
             return np.empty(count, np.int16)
         if len(self.values) < count:
             self.values = np.empty(count, np.int16)

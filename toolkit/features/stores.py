@@ -168,11 +168,11 @@ def extract_session(
     path, label = features_path(out, session.id, extractor.settings), f"{extractor.settings['name']} {session.id}"
     if not path.exists() and (made := session.path / "proc" / "features" / path.name).is_dir():
         link_folder(made, path)  # a reconstruction extracted them
-    with Items(path, extractor.settings, again=not skip_existing) as items:
+    with Items(path, extractor.settings, skip_existing=skip_existing) as items:
         todo = items.left((name, source, row_of[name], int(turns[row_of[name]])) for name, source in made_from.items())
         if todo and any(path.parent.glob(f"{path.name.partition('-')[0]}-*.h5")):
             log.warning("%s: features in .h5 files, of an older version of the toolkit, are not used.", path.parent)
-        todo = items.spread(_extract_into, todo, (session, extractor), label, "image")
+        todo = items.distribute(_extract_into, todo, (session, extractor), label, "image")
         _extract_into(items, todo, session, extractor, workers, label if progress and todo else "")
     return FeatureStore._of(path, items, made_from)
 
@@ -270,8 +270,8 @@ def _extract(
     if extractor.threaded:
         yield from prefetch(read_and_extract, images, workers)
         return
-    pictures = prefetch(read, (row for row, _ in images), workers, ahead=2 * extractor.batch_size)
-    turned = zip(pictures, images, strict=True)
+    pixels = prefetch(read, (row for row, _ in images), workers, ahead=2 * extractor.batch_size)
+    turned = zip(pixels, images, strict=True)
     while batch := list(islice(turned, extractor.batch_size)):
         readable = [(image, turns) for image, (_, turns) in batch if not isinstance(image, str)]
         features = iter(extract_turned(extractor, *zip(*readable, strict=True)) if readable else [])
@@ -338,12 +338,12 @@ def match_sessions(
     """
     made_by = {"features": [store.settings for store in stores], "matcher": matcher.settings}
     path = matches_path(out, *sessions, made_by)
-    with Items(path, made_by, again=not skip_existing) as items:
+    with Items(path, made_by, skip_existing=skip_existing) as items:
         readable = dict.fromkeys((name0, name1) for name0, name1 in pairs if name0 in stores[0] and name1 in stores[1])
         sources = (stores[0].made_from[first] + stores[1].made_from[second] for first, second in readable)
         todo = items.left((match_name(*names), source, *names) for names, source in zip(readable, sources, strict=True))
         label = f"{matcher.settings['name']} {' '.join(sessions)}"
-        todo = items.spread(_match_into, todo, (stores, matcher, label), label, "pair", matcher.batch_size)
+        todo = items.distribute(_match_into, todo, (stores, matcher, label), label, "pair", matcher.batch_size)
         _match_into(items, todo, stores, matcher, label)
     return MatchStore(path, items)
 

@@ -59,7 +59,7 @@ CHANGES = ("rescued", "broken")
 _KEY = ["timestamp", "device_id"]
 BEYOND = 5
 """Error, in stated deviations, beyond which the stated deviation is too small: no chance explains it."""
-FEWEST_FOR_MEDIANS = 30
+MIN_FOR_MEDIANS = 30
 """Poses needed to draw the medians of tenths."""
 RELIABILITY_BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0)
 
@@ -366,14 +366,14 @@ def draw_error_curves(errors: pd.DataFrame, thresholds: Sequence[Threshold] = TH
         marks = sorted({threshold[1 - row] for threshold in thresholds})
         low, high = min([*finite, *marks]), max([*finite, *marks])
         for axis, query in zip(axes[row], queries, strict=True):
-            for map_ in maps:
-                values = errors.loc[(errors.query_device == query) & (errors.map_device == map_), column]
+            for mapped in maps:
+                values = errors.loc[(errors.query_device == query) & (errors.map_device == mapped), column]
                 if not len(values):
                     continue
                 ascending = np.sort(values[np.isfinite(values)].to_numpy(float).clip(1e-4))
                 share = 100 * np.arange(len(ascending) + 1) / len(values)
                 axis.step([low / 2, *ascending, high * 2], [*share, share[-1]], where="post", lw=1.8,
-                          color=color_of(map_), label=f"{map_} map")  # fmt: skip
+                          color=color_of(mapped), label=f"{mapped} map")  # fmt: skip
             for mark in marks:
                 axis.axvline(mark, color="0.45", lw=0.9, ls=":", label="thresholds" if mark == marks[0] else None)
             axis.set(xscale="log", xlim=(low / 1.5, high * 1.5), ylim=(0, 102), xlabel=label)
@@ -437,7 +437,7 @@ def draw_deviations(errors: pd.DataFrame, unit: str = "m") -> "Figure":
             beyond = float(np.mean(actual[chosen] > BEYOND * stated[chosen]))
             label = f"{name}: {chosen.sum()}, {percent(beyond)} % above"
             axis.plot(stated[chosen], actual[chosen], "o", ms=3.5, alpha=0.5, mew=0, color=color, label=label)
-    if len(stated) >= FEWEST_FOR_MEDIANS:
+    if len(stated) >= MIN_FOR_MEDIANS:
         tenths = np.array_split(np.argsort(stated), 10)
         medians = np.array([(np.median(stated[tenth]), np.median(actual[tenth])) for tenth in tenths])
         axis.plot(*medians.T, color="0.15", lw=1.5, marker="o", ms=3, label="medians of tenths of the poses")

@@ -148,14 +148,14 @@ def draw_similarity(embeddings: str | Path, limit: int = 300) -> "Figure":
     query = next((name for name in sessions if name.endswith("_query")), sessions[0])
     maps = [name for name in sessions if name.endswith("_map")] or sessions
     of_others = (name for name in maps if name.rpartition("_")[0] != query.rpartition("_")[0])
-    map_ = next(of_others, maps[0])
-    rows, columns = (_descriptors(Path(embeddings), session, limit) for session in (query, map_))
+    map_id = next(of_others, maps[0])
+    rows, columns = (_descriptors(Path(embeddings), session, limit) for session in (query, map_id))
     products = [row @ column.T for row, column in zip(rows, columns, strict=True)]
     figure = new_figure(8, 4.5)
     plot = figure.subplots()
     values = products[0] if len(products) == 1 else fuse(products)
     image = plot.imshow(values, aspect="auto", interpolation="nearest", cmap="viridis")
-    plot.set(xlabel=f"images of {map_}", ylabel=f"images of {query}")
+    plot.set(xlabel=f"images of {map_id}", ylabel=f"images of {query}")
     figure.colorbar(image, label="cosine similarity" if len(products) == 1 else "fused similarity")
     return figure
 

@@ -43,7 +43,7 @@ OPTIONAL = ("rerank", "sequence")
 DevicePair = Annotated[list[str], Field(min_length=2, max_length=2)]
 PATHS = ("captures", "output_root", "retrieve.mask.poses")
 """Keys whose values are paths; the keys of checkpoints are paths too."""
-MOST_VALUES = 100_000
+MAX_VALUES = 100_000
 """Largest number of values in a manifest: nested YAML aliases can expand to so many that they fill the memory."""
 Chain = list[tuple[Path, dict[str, Any]]]
 """The files of a manifest and their own contents, inherited files first; a later file wins."""
@@ -396,8 +396,8 @@ def _parse_yaml(text: str) -> Any:
         node = loader.get_single_node()
         if node is None:
             return None
-        if _size(node, {}) > MOST_VALUES:
-            raise yaml.YAMLError(f"Its aliases expand to more than {MOST_VALUES:,} values.")
+        if _size(node, {}) > MAX_VALUES:
+            raise yaml.YAMLError(f"Its aliases expand to more than {MAX_VALUES:,} values.")
         _require_single_keys(node, set())
         return loader.construct_document(node)
     except RecursionError:

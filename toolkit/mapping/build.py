@@ -32,7 +32,7 @@ from toolkit.files import Remade, fingerprint, is_current, temporary_folder, wri
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import MapSettings
 from toolkit.mapping.local_map import LocalMap
-from toolkit.mapping.pose_consistency import Survey, SurveyedImages
+from toolkit.mapping.pose_consistency import MapImages, PoseConsistency
 from toolkit.mapping.pose_noise import refined_poses
 from toolkit.mapping.triangulation import (
     MAX_REPROJECTION_ERROR_PX,
@@ -49,7 +49,7 @@ from toolkit.threads import fixed_sums
 _ToMatch = tuple[str, str, int, int]
 """A pair to match: name of its item, fingerprint of the inputs of the matches, indices of the two images."""
 DEPTHS = (2.0, 4.0, 8.0, 16.0)
-"""Depths at which the views of two images are compared, in map lengths (meters; see `Survey.length`)."""
+"""Depths at which the views of two images are compared, in map lengths (meters; see `PoseConsistency.length`)."""
 MAX_EPIPOLAR_ERROR_PX = 4.0  # largest distance of a match from its epipolar line, on either side, pixels
 RATIO = 0.9  # threshold of Lowe's ratio test among the candidates along the epipolar line
 MAX_REFINEMENTS = 3  # rounds of bundle adjustment
@@ -73,7 +73,7 @@ def select_pairs(
         groups: (N,) images of one group (the cameras of one rig at one instant) are never paired, because they have
             almost no baseline.
         per_image: largest number of partners per image.
-        length: unit of `DEPTHS`, in the unit of the poses; see `Survey.length`.
+        length: unit of `DEPTHS`, in the unit of the poses; see `PoseConsistency.length`.
 
     Returns:
         (P, 2) indices, i < j, sorted.
@@ -230,10 +230,10 @@ def _refined(given: "MapPlan", workers: int) -> "MapPlan":
 
     Each round matches and triangulates with limits as wide as the remaining noise asks for.
     """
-    plan, depth = given, given.survey.typical_depth() / given.length
+    plan, depth = given, given.pose_consistency.typical_depth() / given.length
     focal_px = float(np.median([camera.mean_focal_length() for camera in given.cameras]))
     for _ in range(MAX_REFINEMENTS):
-        noise = plan.survey.pairs.noise(plan.length)
+        noise = plan.pose_consistency.pairs.noise(plan.length)
         noise_px = np.radians(noise.direction_deg(depth)) * focal_px
         if plan is given and noise_px < MIN_NOISE_PX:
             break
@@ -243,7 +243,7 @@ def _refined(given: "MapPlan", workers: int) -> "MapPlan":
             wide = given.with_poses(plan.world_from_cams, path, settings, NOISE_LIMIT * noise_px)
             wide.match(0, False, workers)
             local_map = wide.triangulated(0)
-            if plan is given and not given.survey.consistency(local_map).trusted:
+            if plan is given and not given.pose_consistency.judge(local_map).trusted:
                 break  # it would bend the map to intrinsics that are wrong
             keypoints = [wide.keypoints(image) for image in range(len(wide.names))]
             poses = refined_poses(local_map, keypoints, noise, workers)
@@ -263,7 +263,7 @@ class MapPlan(Remade):
         metric: bool = True, length: float | None = None, poses: Mapping[str, Floats] | None = None,
         min_limit_px: float = 0.0,
     ):  # fmt: skip
-        """See `build_map`; `length` is the survey's length if it is known, which saves the survey.
+        """See `build_map`; `length` is that of `pose_consistency` if it is known, which saves the matching.
 
         Limits of errors in pixels are at least `min_limit_px`.
         """
@@ -281,7 +281,7 @@ class MapPlan(Remade):
         self.names = [names[row] for row in self.rows]
         self.cameras = session.cameras(self.rows)
         self.kind, self.groups = _kind_of(features), instants(session, self.rows)
-        self.length = self.survey.length(metric) if length is None else length
+        self.length = self.pose_consistency.length(metric) if length is None else length
         pairs_per_image = settings.pairs_per_image
         self.pairs = select_pairs(self.world_from_cams, self.cameras, self.groups, pairs_per_image, self.length)
         centers, axes = self.world_from_cams[:, :3, 3], self.world_from_cams[:, :3, 2]
@@ -295,17 +295,17 @@ class MapPlan(Remade):
         self.matcher = _matcher_settings(self.kind, max(MAX_EPIPOLAR_ERROR_PX, min_limit_px))
 
     @cached_property
-    def survey(self) -> Survey:
-        """Survey of the poses, from a sample of image pairs."""
+    def pose_consistency(self) -> PoseConsistency:
+        """The check of the poses, from a sample of image pairs."""
         rig_from_cams = self.session.rig_from_cam(self.rows)
         world_from_rigs = self.world_from_cams @ geometry.invert(rig_from_cams)
         sensors = self.session.images["sensor_id"].to_numpy()[self.rows].tolist()
-        images = SurveyedImages(self.names, self.cameras, world_from_rigs, rig_from_cams, self.groups, sensors)
-        return Survey(images, self._features_of, self.kind)
+        images = MapImages(self.names, self.cameras, world_from_rigs, rig_from_cams, self.groups, sensors)
+        return PoseConsistency(images, self._features_of, self.kind)
 
     @cached_property
     def of_worker(self) -> Any:
-        """This plan for a worker, which gets the length and so needs no survey."""
+        """This plan for a worker, which gets the length and so matches no sample."""
         more = {"length": self.length, "poses": self._poses, "min_limit_px": self._min_limit_px}
         return MapPlan.elsewhere(self.session, self.features, self.path, self.settings, self.seed, **more)
 
@@ -316,7 +316,7 @@ class MapPlan(Remade):
         more: dict[str, Any] = {"length": self.length, "min_limit_px": min_limit_px}
         more["poses"] = dict(zip(self.names, world_from_cams, strict=True))
         plan = MapPlan(self.session, self.features, path, settings, self.seed, **more)
-        plan.survey = self.survey.with_poses(world_from_cams)
+        plan.pose_consistency = self.pose_consistency.with_poses(world_from_cams)
         return plan
 
     @cached_property
@@ -337,10 +337,10 @@ class MapPlan(Remade):
     def match(self, number: int, skip_existing: bool = True, workers: int = 1) -> None:
         """Match the pairs of a tile along epipolar lines; skip pairs that are matched already."""
         pairs, names, made_from = self.pairs_of[number].tolist(), self.names, self._made_from
-        with Items(self._matches_path(number), self._matches_made_by(number), again=not skip_existing) as items:
+        with Items(self._matches_path(number), self._matches_made_by(number), skip_existing=skip_existing) as items:
             todo = items.left((match_name(names[i], names[j]), made_from[i] + made_from[j], i, j) for i, j in pairs)
             label = f"match {self.session.id}" + (f" {number + 1}/{len(self.tiles)}" if len(self.tiles) > 1 else "")
-            todo = items.spread(_match_share, todo, (self.of_worker,), label, "pair")
+            todo = items.distribute(_match_share, todo, (self.of_worker,), label, "pair")
             self.match_into(items, todo, workers, label if todo else "")
 
     def match_into(self, items: Items, todo: Sequence[_ToMatch], workers: int, label: str) -> None:
@@ -425,7 +425,7 @@ class MapPlan(Remade):
             self._save(join_tiles(self.tiles, lambda number: LocalMap.load(self.tile_path(number)), images, folder))
 
     def _save(self, local_map: LocalMap) -> None:
-        local_map.judged(self.survey.consistency(local_map)).save(self.path)
+        local_map.judged(self.pose_consistency.judge(local_map)).save(self.path)
 
     def _features_of(self, image: int) -> LocalFeatures:
         return self.features[self.names[image]]

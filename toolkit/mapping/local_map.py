@@ -94,7 +94,7 @@ class LocalMap:
     obs_keypoint: Ints
     obs_point: Ints
     noise_px: NDArray[np.float32]  # (P,) standard deviation of a point's observations per axis; equal for one kind
-    length: float = 1.0  # the length that localizers treat as one meter, in the unit of the poses; see `Survey.length`
+    length: float = 1.0  # that localizers treat as one meter, in the unit of the poses; see `PoseConsistency.length`
     consistency: Consistency = field(default_factory=Consistency)
 
     @cached_property

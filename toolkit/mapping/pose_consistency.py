@@ -25,7 +25,7 @@ from toolkit.features.matching import verified_matches
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import RerankSettings
 from toolkit.mapping.local_map import OPENGL_AXES, Consistency, LocalMap
-from toolkit.mapping.pose_noise import SurveyedPairs, VerifiedPair
+from toolkit.mapping.pose_noise import PosedPairs, VerifiedPair
 from toolkit.threads import fixed_sums
 
 ANCHORS = 12  # number of images, evenly spread over the map, that are matched with their neighbors
@@ -58,7 +58,7 @@ WORTH_DEG, WORTH_LENGTHS = 0.05, 0.005
 """Noise of the map's poses, degrees and map lengths per axis, from which the user is told of it."""
 
 
-class SurveyedImages(NamedTuple):
+class MapImages(NamedTuple):
     """The N images of a map."""
 
     names: Sequence[str]
@@ -73,11 +73,11 @@ class SurveyedImages(NamedTuple):
         return self.world_from_rigs @ self.rig_from_cams
 
 
-class Survey:
+class PoseConsistency:
     """Matches a sample of the map images without their poses, and compares the matches with the poses."""
 
     @fixed_sums
-    def __init__(self, images: SurveyedImages, load: Callable[[int], LocalFeatures], kind: FeatureKind):
+    def __init__(self, images: MapImages, load: Callable[[int], LocalFeatures], kind: FeatureKind):
         """
         Args:
             images: all images of the map.
@@ -135,11 +135,11 @@ class Survey:
         return depth / NOMINAL_DEPTH or 1.0
 
     @fixed_sums
-    def consistency(self, local_map: LocalMap) -> Consistency:
+    def judge(self, local_map: LocalMap) -> Consistency:
         """Judge the poses of the map.
 
         Args:
-            local_map: the map triangulated with the poses; it has the same images as the survey.
+            local_map: the map triangulated with the poses; it has the same images.
         """
         lengths = np.diff(local_map.point_starts)
         three = float((lengths >= 3).mean()) if len(lengths) else 0.0
@@ -163,19 +163,19 @@ class Survey:
             result,
             verdict="consistent",
             wrong=self._wrong_images(local_map),
-            camera=pairs.misfit(self.images.cameras),
+            camera=pairs.check_intrinsics(self.images.cameras),
             rotation_noise_deg=round(noise.rotation_deg, 4),
             position_noise=round(noise.position, 6),
             direction_noise_deg=round(noise.direction_deg(self.typical_depth() / local_map.length), 4),
         )
 
     @property
-    def pairs(self) -> SurveyedPairs:
+    def pairs(self) -> PosedPairs:
         """The sample with the poses of its images, for their noise and the intrinsics."""
-        return SurveyedPairs(self.sample, self.images.world_from_cams)
+        return PosedPairs(self.sample, self.images.world_from_cams)
 
-    def with_poses(self, world_from_cams: Floats) -> "Survey":
-        """Return this survey of the same matches for other poses (N, 4, 4)."""
+    def with_poses(self, world_from_cams: Floats) -> "PoseConsistency":
+        """Return this check by the same matches of other poses (N, 4, 4)."""
         other = copy(self)
         world_from_rigs = world_from_cams @ geometry.invert(self.images.rig_from_cams)
         other.images = self.images._replace(world_from_rigs=world_from_rigs)
@@ -229,7 +229,7 @@ class Survey:
         return [other for other in images if instants[other] != instants[index]]
 
 
-def _sampled_pairs(images: SurveyedImages) -> list[tuple[int, int]]:
+def _sampled_pairs(images: MapImages) -> list[tuple[int, int]]:
     """Return pairs all over a map that are probably covisible: images near each other, and successive images.
 
     Where poses are wrong, one of the two still works: a wrong convention keeps neighbors close, and the order of the
@@ -292,7 +292,7 @@ def _agreeing(
     return agree
 
 
-def _fitting_convention(images: SurveyedImages, pairs: Sequence[VerifiedPair], share_given: float) -> str:
+def _fitting_convention(images: MapImages, pairs: Sequence[VerifiedPair], share_given: float) -> str:
     """Describe the simplest convention under which most pairs agree with the poses; return "" if there is none.
 
     The share of agreeing pairs must clearly exceed `share_given`, that of the poses as they are.
@@ -386,7 +386,7 @@ def remarks(consistency: Consistency, length: float, metric: bool) -> str:
 
     Args:
         consistency: of the map.
-        length: that of the map, see `Survey.length`.
+        length: that of the map, see `PoseConsistency.length`.
         metric: whether the poses are in meters, as far as is known.
     """
     parts = [consistency.text, _noise_text(consistency, length, metric)]

@@ -62,15 +62,15 @@ class PoseNoise(NamedTuple):
     """Standard deviations of the noise of a map's poses, per axis."""
 
     rotation_deg: float = 0.0
-    position: float = 0.0  # in map lengths, see `Survey.length`
+    position: float = 0.0  # in map lengths, see `PoseConsistency.length`
 
     def direction_deg(self, depth: float) -> float:
         """Return the standard deviation of the direction to a point at a depth, map lengths; NaN: far away."""
         return float(np.hypot(self.rotation_deg, np.nan_to_num(np.degrees(np.arctan(self.position / depth)))))
 
 
-class SurveyedPairs:
-    """The matches of all pairs of a survey, one after the other, with the poses of their images."""
+class PosedPairs:
+    """The matches of all pairs of a sample, one after the other, with the poses of their images."""
 
     def __init__(self, pairs: Sequence[VerifiedPair], world_from_cams: Floats) -> None:
         """
@@ -128,7 +128,7 @@ class SurveyedPairs:
         covariance L + L D L. With S, the root of L, the pseudoinverse of S times g has the covariance 1 + S D S.
 
         Args:
-            length: `Survey.length`, in the unit of the poses.
+            length: `PoseConsistency.length`, in the unit of the poses.
         """
         parts = self._motions(length)
         if len(parts) < MIN_PAIRS:
@@ -184,7 +184,7 @@ class SurveyedPairs:
             parts.append((share * weighted.T @ jacobian, share * weighted.T @ errors))
         return parts
 
-    def misfit(self, cameras: Sequence[pycolmap.Camera]) -> str:
+    def check_intrinsics(self, cameras: Sequence[pycolmap.Camera]) -> str:
         """Say which one change of all intrinsics the matches ask for; empty if for none.
 
         Args:

@@ -38,9 +38,9 @@ SIDE = 504
 MODES = ("upper_bound_resize",)
 REFERENCES = ("saddle_balanced", "first")
 """Ways to choose the reference view, whose frame is the world."""
-_LEAST_CHOICE = 3  # with fewer views, the first is the reference
+_MIN_CHOICE = 3  # with fewer views, the first is the reference
 _NORM_EPS = 1e-5  # epsilon of the last norm, and of those on queries and keys
-_LEAST_TANGENT = 1e-6
+_MIN_TANGENT = 1e-6
 _HEAD_DIM = 64
 _SIZES = (768, 384)
 """Channels of Base and Small."""
@@ -92,7 +92,7 @@ def cameras_from_pose_encoding(pose_enc: ArrayLike, size: tuple[int, int]) -> tu
     """
     encoding = np.asarray(pose_enc, np.float64).copy()
     half = encoding[..., 7:] / 2
-    encoding[..., 7:] = np.where(np.tan(half) < _LEAST_TANGENT, 2 * _LEAST_TANGENT, 2 * half)
+    encoding[..., 7:] = np.where(np.tan(half) < _MIN_TANGENT, 2 * _MIN_TANGENT, 2 * half)
     world_from_cam, intrinsics = multiview.cameras_from_pose_encoding(encoding, size)
     return invert(make_pose(world_from_cam[..., :3], world_from_cam[..., 3]))[..., :3, :], intrinsics
 
@@ -175,7 +175,7 @@ def choose_reference(class_tokens: Tensor, way: str) -> Tensor:
     if way not in REFERENCES:
         raise ValueError(f"reference is {way!r}; expected one of {list(REFERENCES)}.")
     S = class_tokens.shape[1]
-    if way == "first" or S < _LEAST_CHOICE:
+    if way == "first" or S < _MIN_CHOICE:
         return torch.zeros(len(class_tokens), dtype=torch.long, device=class_tokens.device)
     lengths = class_tokens.norm(dim=-1)
     units = class_tokens / lengths[..., None]

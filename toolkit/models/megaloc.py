@@ -1,4 +1,4 @@
-"""MegaLoc (Berton and Masone, 2025): a global descriptor of photographs for place recognition.
+"""MegaLoc (Berton and Masone, 2025): a global descriptor of images for place recognition.
 
 A DINOv2 ViT-B/14, whose patches are aggregated by optimal transport (SALAD, Izquierdo and Civera, CVPR 2024). The
 official network is MIT-licensed, at github.com/gmberton/MegaLoc.
@@ -95,7 +95,7 @@ class Aggregator(nn.Module):
 
 
 class MegaLoc(nn.Module):
-    """The network: maps photographs to unit vectors. The defaults are the official sizes."""
+    """The network: maps images to unit vectors. The defaults are the official sizes."""
 
     def __init__(
         self,

@@ -42,7 +42,7 @@ SPECIAL = 17
 _EPS = 1e-5
 _STORAGE = 4
 _POSE = 9
-_LEAST_FIELD_OF_VIEW = 0.01  # radians
+_MIN_FIELD_OF_VIEW = 0.01  # radians
 
 
 def cropped_size(width: int, height: int) -> tuple[int, int]:
@@ -202,7 +202,7 @@ class CameraHead(nn.Module):
         for block in self.trunk[:-1]:
             x = block(x)
         encoding = self.camera_branch(self.trunk_norm(self.trunk[-1](x, kept=cameras)))
-        return torch.cat([encoding[..., :7], F.relu(encoding[..., 7:]) + _LEAST_FIELD_OF_VIEW], dim=-1)
+        return torch.cat([encoding[..., :7], F.relu(encoding[..., 7:]) + _MIN_FIELD_OF_VIEW], dim=-1)
 
 
 class ShuffleHead(DenseHead):

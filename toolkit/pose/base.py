@@ -70,7 +70,7 @@ _FROM_OTHERS = ("inlier_ratio", "position_std", "rotation_std_deg")
 SEARCH_DEG = (1.0, 6.0)
 """Smallest and largest radius of the search for keypoints around the projections of a prior pose, degrees."""
 NEARBY_M = 3.0
-"""Assumed depth of the scene, in map lengths (see `Survey.length`), to turn the uncertainty of a position into an
+"""Assumed depth of the scene, in map lengths (see `LocalMap.length`), to turn the uncertainty of a position into an
 angle."""
 MAX_STATUS = 70
 """Letters of a status that tables and titles show; the tables of the poses have all of it."""
@@ -234,8 +234,8 @@ class QueryResult:
     remark: str = ""
     """Intrinsics that fit the query better than the stated ones; images that cannot be read; for a prediction, what was
     left out or is unknown. Column `reason` of the table."""
-    misfit: bool = False
-    """Whether the matches contradict the intrinsics of the query, see `map_matching.find_misfit`. No other features
+    camera_contradicted: bool = False
+    """Whether the matches contradict the query's intrinsics, see `map_matching.check_intrinsics`. No other features
     repair that. A small contradiction only widens the covariance."""
     focals_px: tuple[float, ...] = ()
     """Per query image, the focal length that fits, or NaN if the focal length is not the problem. Empty if the
@@ -382,7 +382,7 @@ class QueryResult:
         arrays |= {"found_by": codes.astype(np.uint8), "found_by_labels": labels.astype(object)}
         arrays["world_from_rig"] = np.full((4, 4), np.nan) if self.world_from_rig is None else self.world_from_rig
         arrays["covariance"] = np.full((6, 6), np.nan) if self.covariance is None else self.covariance
-        arrays["misfit"] = np.array(self.misfit)
+        arrays["misfit"] = np.array(self.camera_contradicted)
         arrays["rivals"] = np.array([rival.world_from_rig for rival in self.rivals]).reshape(-1, 4, 4)
         arrays["rival_supports"] = np.array([rival.support for rival in self.rivals], np.float64)
         return arrays | {name: np.array(getattr(self, name), object) for name in _NAMES}
@@ -413,7 +413,7 @@ class QueryResult:
             rejected=rejected,
             correspondences=Correspondences(**read, found_by=found_by),
             rivals=tuple(map(Rival, arrays["rivals"].reshape(-1, 4, 4), arrays["rival_supports"].tolist())),
-            misfit=bool(arrays["misfit"]),
+            camera_contradicted=bool(arrays["misfit"]),
         )
 
 
@@ -467,25 +467,25 @@ class View:
     """File that is black where to extract no features, of the image's size; None: no mask."""
     _decoded: dict[tuple[bool, int | None], NDArray[np.uint8]] = field(default_factory=dict, repr=False, compare=False)
 
-    def read(self, color: bool, least_side: int | None = None) -> NDArray[np.uint8]:
+    def read(self, color: bool, min_side: int | None = None) -> NDArray[np.uint8]:
         """Return the pixels in color, (H, W, 3), or gray, (H, W), decoded once; see `capture.images.read_image`.
 
         Raises:
             ImageError: the image cannot be read.
             CameraError: the image has another size than its camera.
         """
-        if (color, least_side) not in self._decoded:
-            pixels = pixels_of(self.image, not color, least_side)
+        if (color, min_side) not in self._decoded:
+            pixels = pixels_of(self.image, not color, min_side)
             width, height = pixels.shape[1::-1]
-            if least_side is not None and isinstance(self.image, Path):  # perhaps decoded at a smaller size
+            if min_side is not None and isinstance(self.image, Path):  # perhaps decoded at a smaller size
                 width, height = stored_size(self.image)
             if (self.camera.width, self.camera.height) != (width, height):
                 raise CameraError(
                     f"The image is {width} x {height} pixels, its camera {self.camera.width} x "
                     f"{self.camera.height}. Give the intrinsics of the image as it is stored."
                 )
-            self._decoded[color, least_side] = pixels
-        return self._decoded[color, least_side]
+            self._decoded[color, min_side] = pixels
+        return self._decoded[color, min_side]
 
     def extract(self, method: AnyMethod) -> LocalFeatures:
         """Return the local features of one kind; see `read` and `usable` for the errors."""
@@ -729,7 +729,7 @@ class RigQuery:
         points: Floats,
         max_error_deg: float,
         seed: int,
-        least_inliers: int = 0,
+        min_inliers: int = 0,
         max_trials: int = MAX_RANSAC_TRIALS,
     ) -> Floats | None:
         """Return the pose rig_from_world (4, 4) with the most inliers, by LO-RANSAC (PoseLib), or None.
@@ -741,7 +741,7 @@ class RigQuery:
             points: (P, 3) the map points.
             max_error_deg: inlier threshold, as an angle.
             seed: of the random generators.
-            least_inliers: RANSAC may miss poses with fewer inliers, which saves time.
+            min_inliers: RANSAC may miss poses with fewer inliers, which saves time.
             max_trials: largest number of samples.
         """
         if len(np.unique(matches.point)) < 4:
@@ -750,10 +750,10 @@ class RigQuery:
             chosen = np.random.default_rng(seed).permutation(len(matches))
             kept = np.zeros(len(matches), bool)
             kept[chosen[:MAX_RANSAC_MATCHES]] = True
-            least_inliers = least_inliers * MAX_RANSAC_MATCHES // len(matches)
+            min_inliers = min_inliers * MAX_RANSAC_MATCHES // len(matches)
             matches = matches[kept]
-        least_share = np.clip(least_inliers / len(matches), 1e-3, 0.99)
-        trials = np.log(1 - RANSAC_CONFIDENCE) / np.log1p(-(least_share**3))  # to draw one sample of three inliers
+        min_share = np.clip(min_inliers / len(matches), 1e-3, 0.99)
+        trials = np.log(1 - RANSAC_CONFIDENCE) / np.log1p(-(min_share**3))  # to draw one sample of three inliers
         options = {
             "success_prob": RANSAC_CONFIDENCE,
             "dyn_num_trials_mult": 1.0,

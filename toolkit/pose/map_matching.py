@@ -66,13 +66,13 @@ WIDENINGS = (8.0, 8.0, 4.0, 2.0)  # factors of the inlier limit in the first ste
 STEPS = 15
 SETTLED_PX = 0.02  # largest motion of a projection in a step at which the fit has converged
 MIN_SCALE_PX = 0.5  # least scale of the Cauchy weights
-PRIOR_STD = (0.2, 0.02, 0.02, 0.05)  # prior standard deviations of the four `Misfit.parameters`
+PRIOR_STD = (0.2, 0.02, 0.02, 0.05)  # prior standard deviations of the four `IntrinsicsCheck.parameters`
 FOCALS = (0.45, 0.7, 1.1, 1.7, 2.6, 4.0)  # focal lengths of the cameras to try, over the longer side of the image
 MORE = 3.0
 """Such a camera fits if its odds of an inlier, times the cells that have one, are so many times those of the stated.
 A wrong camera fits a part of the image: where focal lengths, distortions or principal points are absurd, or images are
 cropped off-center, the ratio is 4.5 and more; of right cameras by night, where windows repeat, at most 2.6."""
-LEAST = 12  # its inliers must be more than these
+MIN_INLIERS = 12  # its inliers must be more than these
 FEW = 0.3  # share of inliers among the matches below which other cameras are tried if the first step is certain
 VERY_FEW = 0.2  # share below which they are tried in any case
 TRIALS = 1000  # samples of their RANSAC
@@ -435,7 +435,7 @@ class MapMatcher:
 
 
 @dataclass(frozen=True)
-class Misfit:
+class IntrinsicsCheck:
     """Intrinsics that fit the matches of a pose significantly better than the stated ones."""
 
     shift: Floats
@@ -456,16 +456,16 @@ class Misfit:
 
     @property
     def _at_fault(self) -> Ints:
-        """(C,) what misfits most: focal length (0), principal point (1), distortion (2) or nothing (-1)."""
+        """(C,) what is most at fault: focal length (0), principal point (1), distortion (2) or nothing (-1)."""
         excess = self.shares / MAX_SHARES
         return np.where(excess.any(axis=1), excess.argmax(axis=1), -1)
 
     def focals_px(self, cameras: list[pycolmap.Camera]) -> tuple[float, ...]:
-        """Return the focal length that fits each camera; NaN if something else or nothing misfits."""
+        """Return the focal length that fits each camera; NaN if something else or nothing is at fault."""
         return tuple(np.where(self._at_fault == 0, self._fitted(cameras)[:, 0], np.nan).tolist())
 
     def centers_px(self, cameras: list[pycolmap.Camera]) -> tuple[tuple[float, float], ...]:
-        """Return the principal point that fits each camera; NaN if something else or nothing misfits."""
+        """Return the principal point that fits each camera; NaN if something else or nothing is at fault."""
         centers = np.where(self._at_fault[:, None] == 1, self._fitted(cameras)[:, 1:], np.nan)
         return tuple((x, y) for x, y in centers.tolist())
 
@@ -476,7 +476,7 @@ class Misfit:
         return np.column_stack([stated[:, 0] * (1 + focal), stated[:, 1:] + stated[:, :1] * np.transpose(center)])
 
     def reason(self, cameras: list[pycolmap.Camera]) -> str:
-        """Return a text that compares, for each camera that misfits, the fitted and the stated value."""
+        """Return a text that compares, for each camera at fault, the fitted and the stated value."""
         if np.isnan(self.parameters).any():
             return "the matches contradict the intrinsics, and no others were found that fit: check model and numbers"
         texts, stated, fitted = [], _stated(cameras), self._fitted(cameras)
@@ -497,7 +497,7 @@ def _stated(cameras: list[pycolmap.Camera]) -> Floats:
     return np.array([(one.mean_focal_length(), one.principal_point_x, one.principal_point_y) for one in cameras])
 
 
-def find_misfit(
+def check_intrinsics(
     query: RigQuery,
     rig_from_world: Floats,
     matches: Matches,
@@ -505,7 +505,7 @@ def find_misfit(
     max_error_deg: float,
     focal_alone: bool = False,
     noise_deg: float = 0.0,
-) -> Misfit | None:
+) -> IntrinsicsCheck | None:
     """Return the intrinsics that fit significantly better than the stated ones; None if there are none.
 
     Gauss-Newton with Cauchy weights fits pose and intrinsics. An F-test tells whether the change is significant.
@@ -538,12 +538,12 @@ def find_misfit(
             return other
     if fitted is None or by_chance > SUSPICIOUS:
         unknown = np.full((len(query.cameras), 4), np.nan)
-        return Misfit(np.zeros(6), unknown, np.zeros((len(unknown), 3))) if by_chance < CERTAIN else None
-    return problem.misfit(start, fitted, free, float(np.tan(np.radians(noise_deg)) * query.focals_px.mean()))
+        return IntrinsicsCheck(np.zeros(6), unknown, np.zeros((len(unknown), 3))) if by_chance < CERTAIN else None
+    return problem.check(start, fitted, free, float(np.tan(np.radians(noise_deg)) * query.focals_px.mean()))
 
 
-def _try_cameras(stated: "_Problem", start: "_Estimate", inliers: Bools) -> Misfit | None:
-    """Return the misfit of stated cameras to which others are clearly preferable; None if there are no such others.
+def _try_cameras(stated: "_Problem", start: "_Estimate", inliers: Bools) -> IntrinsicsCheck | None:
+    """Return the check of stated cameras to which others are clearly preferable; None if there are no such others.
 
     The others have the principal point in the center of the image and, to start with, no distortion.
 
@@ -556,7 +556,7 @@ def _try_cameras(stated: "_Problem", start: "_Estimate", inliers: Bools) -> Misf
         """Return the odds of an inlier, times the cells that have one."""
         return stated.query.num_cells(stated.matches[inliers]) * int(inliers.sum()) / max(int((~inliers).sum()), 1)
 
-    best, misfit = MORE * fit_of(inliers), None
+    best, check = MORE * fit_of(inliers), None
     for share in FOCALS:
         cameras = [_simple(camera, share) for camera in stated.query.cameras]
         query = RigQuery(cameras, stated.query.rig_from_cams, [[] for _ in cameras])
@@ -565,15 +565,15 @@ def _try_cameras(stated: "_Problem", start: "_Estimate", inliers: Bools) -> Misf
             continue
         problem = _Problem(query, stated.matches, stated.points, stated.max_error_deg)
         fitted = problem.fit(_Estimate(pose, np.zeros(problem.unknowns - 6)), ~np.zeros(problem.unknowns, bool))
-        if fitted is not None and (found := problem.inliers(fitted)).sum() > LEAST and fit_of(found) > best:
+        if fitted is not None and (found := problem.inliers(fitted)).sum() > MIN_INLIERS and fit_of(found) > best:
             best = fit_of(found)
             changes = np.array(list(map(_change, stated.query.cameras, cameras, fitted.parameters.reshape(-1, 4))))
             # If it is nearly the stated camera, the fit will tell.
             focal, right, down, distortion = changes.T  # and how far they move pixels, relatively
             sizes = np.column_stack([np.abs(np.log1p(focal)), np.hypot(right, down), np.abs(distortion)])
             largest = np.where(sizes == sizes.max(axis=1, keepdims=True), 1.0, 0.0)
-            misfit = Misfit(_motion(start, fitted), changes, largest) if sizes.max() > ABSURD else None
-    return misfit
+            check = IntrinsicsCheck(_motion(start, fitted), changes, largest) if sizes.max() > ABSURD else None
+    return check
 
 
 def _simple(camera: pycolmap.Camera, share: float) -> pycolmap.Camera:
@@ -584,7 +584,7 @@ def _simple(camera: pycolmap.Camera, share: float) -> pycolmap.Camera:
 
 
 def _change(stated: pycolmap.Camera, other: pycolmap.Camera, parameters: Floats) -> Floats:
-    """Return the `Misfit.parameters` (4,) from stated intrinsics to those at a change (4,) of another camera."""
+    """Return `IntrinsicsCheck.parameters` (4,) from stated intrinsics to those at a change (4,) of another camera."""
     (focal_px, *center), (other_px, *other_center) = _stated([stated, other])
     center, other_center = np.array(center), other_center + other_px * parameters[1:3]
     corner = np.hypot(stated.width, stated.height) / 2 / focal_px
@@ -595,14 +595,14 @@ def _change(stated: pycolmap.Camera, other: pycolmap.Camera, parameters: Floats)
 
 
 def _motion(start: "_Estimate", end: "_Estimate") -> Floats:
-    """Return `Misfit.shift` (6,) from one pose to another."""
+    """Return `IntrinsicsCheck.shift` (6,) from one pose to another."""
     return geometry.small_motions((start.rig_from_world @ geometry.invert(end.rig_from_world))[None])[0]
 
 
 class _Estimate(NamedTuple):
     rig_from_world: Floats
     parameters: Floats
-    """(4 C,) changes of the intrinsics, `Misfit.parameters` flattened."""
+    """(4 C,) changes of the intrinsics, `IntrinsicsCheck.parameters` flattened."""
 
 
 class _Step(NamedTuple):
@@ -711,7 +711,7 @@ class _Problem:
         """Tell which matches (K,) are inliers."""
         return np.linalg.norm(self.linearize(estimate)[0], axis=1) < self._limits_px
 
-    def misfit(self, start: _Estimate, fitted: _Estimate, free: Bools, noise_px: float) -> Misfit | None:
+    def check(self, start: _Estimate, fitted: _Estimate, free: Bools, noise_px: float) -> IntrinsicsCheck | None:
         """Return what fitted intrinsics say of the stated ones; None if noise alone may explain the difference.
 
         Args:
@@ -750,5 +750,5 @@ class _Problem:
                     motion = np.linalg.solve(information[:6, :6], information[:6, tested] @ changes[tested])
                     sizes = np.degrees(np.linalg.norm(motion[:3])), np.linalg.norm(motion[3:])
                     shares[camera, kind] = max(np.divide(sizes, AGREEMENT))
-        at_fault = by_chance <= max(SIGNIFICANCE, float(by_chance.min()))
-        return Misfit(_motion(start, fitted), fitted.parameters.reshape(-1, 4), np.where(at_fault, shares, 0.0))
+        shares[~(by_chance <= max(SIGNIFICANCE, float(by_chance.min())))] = 0.0
+        return IntrinsicsCheck(_motion(start, fitted), fitted.parameters.reshape(-1, 4), shares)

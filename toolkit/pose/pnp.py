@@ -42,7 +42,7 @@ from toolkit.pose.base import (
     agree,
     stds_of,
 )
-from toolkit.pose.map_matching import MapMatcher, MappedFeatures, MatchCache, Vicinity, find_misfit
+from toolkit.pose.map_matching import MapMatcher, MappedFeatures, MatchCache, Vicinity, check_intrinsics
 from toolkit.threads import fixed_sums
 
 # Of the probability that a pose is correct
@@ -132,7 +132,7 @@ def bounded_by_deviation(probability: float, position_std: float, rotation_std_d
 
     Args:
         probability: that of the pose without this bound.
-        position_std: of the pose, map lengths, see `Survey.length`, as in `EVIDENCE`.
+        position_std: of the pose, map lengths, see `LocalMap.length`, as in `EVIDENCE`.
         rotation_std_deg: of the pose.
     """
     stds = MARGIN * np.array([position_std, rotation_std_deg]) / np.sqrt(3)
@@ -314,7 +314,7 @@ class PnpLocalizer(Localizer):
             result = self._failed(reason, all_matches)
         for prior in priors:
             result = self._compare(rig, all_matches, hypotheses, result, references, prior)
-        result = self._with_misfit(rig, all_matches, result)
+        result = self._with_checked_intrinsics(rig, all_matches, result)
         partly = len(matches.usable) < len(matches.query.features)
         result = _of_all_images(matches, result, missing) if partly else result
         if self.lift is None or result.world_from_rig is not None:
@@ -322,14 +322,14 @@ class PnpLocalizer(Localizer):
         lifted = self.lift(matches.query, matches.references, None, priors)
         return result if lifted is None or lifted.world_from_rig is None else lifted
 
-    def _with_misfit(self, query: RigQuery, matches: Matches, estimate: QueryResult) -> QueryResult:
+    def _with_checked_intrinsics(self, query: RigQuery, matches: Matches, estimate: QueryResult) -> QueryResult:
         """Return the estimate, with a warning if matches made without the pose contradict the query's intrinsics.
 
         The pose remains that of the stated intrinsics. Its covariance grows to cover the pose of those that would fit.
         """
         if estimate.world_from_rig is None:
             return estimate
-        misfit = find_misfit(
+        check = check_intrinsics(
             query,
             geometry.invert(estimate.world_from_rig),
             matches[self.map.track_lengths(matches.point) > 1],  # points with one observation are not triangulated
@@ -338,20 +338,20 @@ class PnpLocalizer(Localizer):
             focal_alone=estimate.rival_support > MAX_RIVAL_SUPPORT,
             noise_deg=self._noise_deg,
         )
-        if misfit is None:
+        if check is None:
             return estimate
         covariance = estimate.covariance
-        wider = None if covariance is None else covariance + np.outer(misfit.shift, misfit.shift)
-        estimate = replace(estimate, covariance=wider, misfit=True)
-        if not misfit.doubtful:
+        wider = None if covariance is None else covariance + np.outer(check.shift, check.shift)
+        estimate = replace(estimate, covariance=wider, camera_contradicted=True)
+        if not check.doubtful:
             return estimate
         return replace(
             estimate,
             status=Status.LOW_CONFIDENCE,
             reason=CAMERA,
-            focals_px=misfit.focals_px(query.cameras),
-            centers_px=misfit.centers_px(query.cameras),
-            remark=misfit.reason(query.cameras),
+            focals_px=check.focals_px(query.cameras),
+            centers_px=check.centers_px(query.cameras),
+            remark=check.reason(query.cameras),
         )
 
     def _compare(
@@ -476,7 +476,7 @@ class PnpLocalizer(Localizer):
         best = sorted(seen_in, key=lambda index: -int(seen_in[index].sum()))
         for index in best[:CONTESTED_REFERENCES]:
             some = matches[seen_in[index]]
-            start = self._ransac(query, some, self.settings.ransac_max_error_deg, least_inliers=5)
+            start = self._ransac(query, some, self.settings.ransac_max_error_deg, min_inliers=5)
             self._add(query, matches, hypotheses, start, 1.0)
 
     def _add_neighbor(self, query: RigQuery, matches: Matches, hypotheses: list[_Hypothesis]) -> None:
@@ -679,8 +679,8 @@ class PnpLocalizer(Localizer):
         shifts = geometry.small_motions(best.rig_from_world @ poses) if near else np.zeros((0, 6))
         return np.asarray((shifts.T * (odds / (1 + odds.sum()))) @ shifts, np.float64)
 
-    def _ransac(self, query: RigQuery, matches: Matches, max_error_deg: float, least_inliers: int = 0) -> Floats | None:
-        return query.ransac(matches, self.map.points, max_error_deg, self.seed, least_inliers)
+    def _ransac(self, query: RigQuery, matches: Matches, max_error_deg: float, min_inliers: int = 0) -> Floats | None:
+        return query.ransac(matches, self.map.points, max_error_deg, self.seed, min_inliers)
 
 
 def least_squares_covariance(

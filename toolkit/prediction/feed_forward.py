@@ -41,7 +41,7 @@ from toolkit.threads import fixed_sums
 
 WIDE_BASELINE = 0.25  # baseline over depth; a wider one counts no more
 NEAR_DUPLICATE = 0.03  # baseline over depth; below, two images are near-duplicates
-LEAST_SIMILARITY = 0.25  # similarity of the worst candidate, where that of the best one is 1
+MIN_SIMILARITY = 0.25  # similarity of the worst candidate, where that of the best one is 1
 ALL_SHARED = 50  # shared points from which two images count as fully covisible
 _LAST = 1e-3  # factor that puts near-duplicates and images without shared view last
 FOCAL_TOLERANCE = 0.2
@@ -88,7 +88,7 @@ def select_references(
         return np.zeros(0, np.int64)
     score, poses = score[usable], poses[usable]
     spread = score.max() - score.min()
-    similarity = LEAST_SIMILARITY + (1 - LEAST_SIMILARITY) * (score - score.min()) / (spread if spread > 0 else 1.0)
+    similarity = MIN_SIMILARITY + (1 - MIN_SIMILARITY) * (score - score.min()) / (spread if spread > 0 else 1.0)
     if spread == 0:
         similarity[:] = 1.0
     shared = _shared_view(poses, [cameras[int(index)] for index in usable], depth_m)
@@ -177,7 +177,7 @@ class FeedForwardLocalizer(Localizer):
         length: float = 1.0,
         unit: tuple[str, float] = ("m", 1.0),
     ):
-        """Depths of the depth maps of the map's session are divided by `length`, see `Survey.length`; `turns` make
+        """Depths of the depth maps of the map's session are divided by `length`, see `LocalMap.length`; `turns` make
         images upright for the predictor; `unit` is the one that lengths are shown in, with its length in the map.
         """
         self.map, self.predictor, self.unit = local_map, predictor, unit
@@ -329,7 +329,7 @@ class FeedForwardLocalizer(Localizer):
 
 def depth_of_images(session: Session, names: Sequence[str], length: float = 1.0) -> Callable[[int], SeenDepth]:
     """Return a function that returns the depth of a map image, by its index in `names`, from the session's depth maps,
-    divided by `length`, see `Survey.length`.
+    divided by `length`, see `LocalMap.length`.
     """
     depths = DepthMaps(session)
 
@@ -366,15 +366,15 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...], image_names: Seque
         R, covariance = rig_from_cam[:3, :3], np.diag(np.full(6, np.inf))
         covariance[:3, :3] = R @ covariances[best][:3, :3] @ R.T
     focals = tuple(answer.focal_px for answer in cameras)
-    misfit = bool(np.isfinite(focals).any())
-    if misfit:
+    contradicted = bool(np.isfinite(focals).any())
+    if contradicted:
         seen = ", ".join(f"{focal:.0f}" for focal in focals if np.isfinite(focal))
         reasons = "; ".join(filter(None, (reasons, f"the network sees a focal length of {seen} px")))
     consistent = [int(i) for index in kept for i in cameras[index].references[alignments[index].consistent]]
     shown = [int(i) for answer in cameras if answer.prediction is not None for i in answer.references]
     return QueryResult(
-        Status.OK if sure and not misfit else Status.LOW_CONFIDENCE,
-        CAMERA if misfit else "",
+        Status.OK if sure and not contradicted else Status.LOW_CONFIDENCE,
+        CAMERA if contradicted else "",
         world_from_rig=pose,
         covariance=covariance,
         references=tuple(image_names[index] for index in dict.fromkeys(consistent)),
@@ -382,15 +382,15 @@ def _combine(query: Query, cameras: tuple[CameraAnswer, ...], image_names: Seque
         scale_std=min(alignments[index].scale_std for index in kept),
         rejected=tuple(image_names[index] for index in dict.fromkeys(shown) if index not in consistent),
         remark=reasons,
-        misfit=misfit,
-        focals_px=focals if misfit else (),
+        camera_contradicted=contradicted,
+        focals_px=focals if contradicted else (),
     )
 
 
 def _other_focal(prediction: Prediction, cameras: Sequence[pycolmap.Camera]) -> float:
-    """Return the predicted focal length of the first photograph of a group if it contradicts the camera, else NaN.
+    """Return the predicted focal length of the first image of a group if it contradicts the camera, else NaN.
 
-    A network errs by some percent, equally for all photographs of a group, so the references give its error.
+    A network errs by some percent, equally for all images of a group, so the references give its error.
     """
     if prediction.intrinsics is None:
         return np.nan

@@ -41,11 +41,11 @@ from toolkit.threads import fixed_sums
 log = logging.getLogger(__name__)
 DEPTH_MAP_STD = 0.01  # relative standard deviation of the scale of a depth map, before it is measured
 MEASURED = 16  # map images, those with the most triangulated points, whose depth maps tell how wrong their scales are
-LEAST_LIFTED = 20  # features of a map image with depth from its depth maps; with fewer, predicted depth is used
-LEAST_RATIOS = 10  # fewest depth ratios that give the predicted depth of an image its own scale
-MOST_RATIOS = 10  # most ratios that count as independent, as the depth errors of networks are spatially correlated
+MIN_LIFTED = 20  # features of a map image with depth from its depth maps; with fewer, predicted depth is used
+MIN_RATIOS = 10  # fewest depth ratios that give the predicted depth of an image its own scale
+MAX_RATIOS = 10  # most ratios that count as independent, as the depth errors of networks are spatially correlated
 MAX_RATIO_SPREAD = 0.25  # relative spread of the ratios of an image above which its predicted depth is wrong
-MOST_FEATURES = 4096  # of a map image, for depth maps alone: with fewer, those of triangulated points hide the others
+MAX_FEATURES = 4096  # of a map image, for depth maps alone: with fewer, those of triangulated points hide the others
 CONTRADICTION = 3.0  # standard deviations per axis above which a pose contradicts the predicted camera
 TINY = float(np.finfo(float).tiny)
 TIE = 0.8  # share of the lifted pose's matches above which the pose from matching alone is kept
@@ -184,7 +184,7 @@ class DepthLifter:
         depth_m = self._seen_depth(image).at(self._first.features[local_map.image_names[image]].keypoints[keypoints])
         ratios = depth_m / geometry.transform(local_map.cams_from_world[image], local_map.points[points])[:, 2]
         ratios = ratios[ratios > 0]
-        return float(np.log(np.median(ratios))) if len(ratios) >= LEAST_RATIOS else np.nan
+        return float(np.log(np.median(ratios))) if len(ratios) >= MIN_RATIOS else np.nan
 
     @cached_property
     def _scale_stds(self) -> tuple[float, float]:
@@ -215,7 +215,7 @@ class DepthLifter:
     def _depth(self, image: int, xy: Floats, predicted: tuple[CameraAnswer, int] | None) -> Depth | None:
         """Return the depth at pixels of a map image from the capture's depth maps, else the predicted depth."""
         depth_m = self._seen_depth(image).at(xy)
-        if np.isfinite(depth_m).sum() >= LEAST_LIFTED and self._fits(image):
+        if np.isfinite(depth_m).sum() >= MIN_LIFTED and self._fits(image):
             return Depth(depth_m, *self._scale_stds)
         if predicted is None:
             return None
@@ -224,12 +224,12 @@ class DepthLifter:
         assert answer.alignment is not None
         ratios = answer.depth_ratios[view - 1]
         ratios = np.log(ratios[ratios > 0])
-        if len(ratios) >= LEAST_RATIOS:
+        if len(ratios) >= MIN_RATIOS:
             middle = float(np.median(ratios))
             spread = 1.4826 * float(np.median(np.abs(ratios - middle)))  # standard deviation if Gaussian
             if spread > MAX_RATIO_SPREAD:
                 return None
-            scale, std, measured = np.exp(middle), spread / np.sqrt(min(len(ratios), MOST_RATIOS)), True
+            scale, std, measured = np.exp(middle), spread / np.sqrt(min(len(ratios), MAX_RATIOS)), True
         elif answer.alignment.scale_known:
             # The scales of predicted depth and predicted cameras may differ slightly.
             scale, measured = answer.alignment.world_from_model.scale, False
@@ -376,7 +376,7 @@ class HybridLocalizer(Localizer):
         prior = self._prior(predicted)
         priors = (*priors, *(() if prior is None else (prior,)))
         estimate = self.pnp.solve(matches, None, priors)
-        if estimate.status is not Status.OK and not estimate.misfit:
+        if estimate.status is not Status.OK and not estimate.camera_contradicted:
             lifted = self.lifter.localize(query, references, answer, priors)
             estimate = estimate if lifted is None else _better(estimate, lifted)
         if predicted.world_from_rig is None:

@@ -41,15 +41,15 @@ class Prediction:
     depth_conf: Sequence[NDArray[np.float32]] | NDArray[np.float32] | None = None
     """S arrays (h, w), larger is more confident."""
     map_from_image: Floats | None = None
-    """(S, 4) scale_x, scale_y, offset_x, offset_y of each view, from pixels of the photograph to pixels of the depth
+    """(S, 4) scale_x, scale_y, offset_x, offset_y of each view, from pixels of the image to pixels of the depth
     map; the center of the top-left pixel is (0.5, 0.5) in both."""
     intrinsics: Floats | None = None
-    """(S, 3, 3) K in pixels of the photographs; NaN where unknown."""
+    """(S, 3, 3) K in pixels of the images; NaN where unknown."""
     reason: str = ""
     """Why the cameras are missing, if known."""
 
     def depth_at(self, view: int, xy: ArrayLike) -> Floats:
-        """Return the depth (N,), in units of the model, at pixels (N, 2) of the photograph.
+        """Return the depth (N,), in units of the model, at pixels (N, 2) of the image.
 
         The depth is bilinearly interpolated. It is NaN outside the depth map, if one of the four neighbors is unknown
         or not positive, and if the nearest one is among the least confident of the view (`LOW_CONFIDENCE`).
@@ -94,7 +94,7 @@ class Predictor(Protocol):
 
 
 def shown_size(view: View) -> Size:
-    """Return the width and height of the upright photograph."""
+    """Return the width and height of the upright image."""
     size = (view.camera.width, view.camera.height)
     return size[::-1] if view.turns % 2 else size
 
@@ -116,13 +116,13 @@ class PlacedView:
 
     @property
     def key(self) -> tuple[Path | int, Size, int]:
-        """Cache key of its encoding. The size of the network image determines the place of the photograph in it."""
+        """Cache key of its encoding. The size of the network image determines the place of the stored image in it."""
         image = self.view.image
         return image if isinstance(image, Path) else id(image), self.size, self.view.turns
 
     @property
     def map_from_image(self) -> Floats:
-        """(4,) from the stored photograph to the network image turned back to its orientation, see `Prediction`."""
+        """(4,) from the stored image to the network image turned back to its orientation, see `Prediction`."""
         camera, (height, width) = self.view.camera, self.size
         corners = np.array([[0, 0], [camera.width, camera.height]], np.float64)
         turned = turn_points(corners, camera.width, camera.height, self.view.turns)
@@ -132,11 +132,11 @@ class PlacedView:
         return np.concatenate([scale, first])
 
     def turned_back(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Turn a map (H, W) of the network image back to the orientation of the stored photograph."""
+        """Turn a map (H, W) of the network image back to the orientation of the stored image."""
         return turn_image(values, -self.view.turns)
 
     def intrinsics(self, K: Floats) -> Floats:
-        """Convert K (3, 3) of the network image to K of the stored photograph, pixels."""
+        """Convert K (3, 3) of the network image to K of the stored image, pixels."""
         height, width = self.size
         [center] = turn_points(K[None, :2, 2], width, height, -self.view.turns)
         scale, offset = self.map_from_image[:2], self.map_from_image[2:]
@@ -146,7 +146,7 @@ class PlacedView:
 
     @property
     def outside(self) -> NDArray[np.bool_]:
-        """(H, W) mask of the pixels of the network image that the photograph does not cover."""
+        """(H, W) mask of the pixels of the network image that the stored image does not cover."""
         scale, offset = self.layout.scale[self.number], self.layout.offset[self.number]
         ends = np.rint(np.array([offset, offset + scale * shown_size(self.view)])).astype(int)
         (left, top), (right, bottom) = np.maximum(ends, 0)

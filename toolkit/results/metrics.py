@@ -193,7 +193,7 @@ def camera_messages(session: "Session", tables: Sequence[pd.DataFrame]) -> list[
     """Return a message for each camera whose focal length or principal point does not fit most of its queries.
 
     Two images must tell, or one whose probability is that of `ok` poses: wrong matches fit some focal length, too.
-    Cameras whose names differ only in a timestamp at the end count as one: a phone may have one for each picture.
+    Cameras whose names differ only in a timestamp at the end count as one: a phone may have one for each image.
 
     Args:
         session: session of the queries.

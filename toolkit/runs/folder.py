@@ -49,7 +49,7 @@ OLDER = "older"
 """Status of a stage that this run left out (`--only`), and whose results are older than what they were made from."""
 # Distributions whose versions may change results.
 _VERSIONS = ("numpy", "pycolmap", "faiss-cpu", "opencv-python-headless", "pandas", "pillow", "torch", "rerun-sdk")
-MOST_RUNS = 100
+MAX_RUNS = 100
 """Limit of runs in a sweep: more are most likely a mistake."""
 _NO_RESULT = {"name", "output_root", "tolerate_failed", "description"}
 """Keys of a manifest that change no result."""
@@ -380,8 +380,8 @@ def swept_runs(name: str, sweeps: Sequence[str]) -> dict[str, list[str]]:
         texts = [yaml.safe_dump(value, default_flow_style=True, width=10**6).split("\n")[0] for value in parsed]
         values[key] = list(dict.fromkeys(texts))
     combinations = [dict(zip(values, chosen, strict=True)) for chosen in product(*values.values())]
-    if len(combinations) > MOST_RUNS:
-        raise ManifestError.at("--sweep", f"{len(combinations)} runs", f"at most {MOST_RUNS}", "Use fewer values.")
+    if len(combinations) > MAX_RUNS:
+        raise ManifestError.at("--sweep", f"{len(combinations)} runs", f"at most {MAX_RUNS}", "Use fewer values.")
     runs = {variant_name(name, keys): [f"{key}={value}" for key, value in keys.items()] for keys in combinations}
     if len(runs) < len(combinations):
         found = "two runs with the same folder name"

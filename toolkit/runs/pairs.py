@@ -58,7 +58,7 @@ class PairRows:
             row |= {name: row.pop(name) for name in ("seconds", "skipped", "path") if name in row} | {"reason": ""}
             note.unlink(missing_ok=True)
         except DamagedError:
-            raise  # damaged files are rebuilt, see `store.items.heals`
+            raise  # damaged files are rebuilt, see `store.items.retry_damaged`
         except OF_THE_DATA as error:
             log.warning("%s is left out: %s", name, error)
             row.clear()

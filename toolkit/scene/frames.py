@@ -22,7 +22,7 @@ from toolkit.sequences.pose_graph import FAR, PlacedPiece, is_sure, localize_pie
 from toolkit.threads import fixed_sums
 
 Images = Image | Sequence[Image] | None
-"""The picture of a frame, one picture per camera of a rig, or None for a frame with odometry only."""
+"""The image of a frame, one image per camera of a rig, or None for a frame with odometry only."""
 Cameras = pycolmap.Camera | Sequence[pycolmap.Camera]
 
 
@@ -39,22 +39,22 @@ class LocalizedFrames:
     piece: Ints
     """(N,) number of the piece of odometry; losses of tracking separate pieces."""
     single: dict[int, QueryResult]
-    """Estimate from each picture alone, by frame."""
-    again: dict[int, QueryResult]
-    """Estimates of doubtful pictures that were localized again near their predicted pose, by frame."""
+    """Estimate from each image alone, by frame."""
+    relocalized: dict[int, QueryResult]
+    """Estimates of doubtful images that were localized again near their predicted pose, by frame."""
 
 
 def _localize(
-    map_: Map,
+    scene_map: Map,
     rig_from_cams: NDArray[np.float64] | None,
     turns: Sequence[int] | None,
-    picture: Images,
+    image: Images,
     cameras: Cameras,
     near: RoughPose | None = None,
 ) -> QueryResult:
-    """Localize the picture of a frame, alone or near a pose. A picture that cannot be read gives `failed`."""
+    """Localize the image of a frame, alone or near a pose. An image that cannot be read gives `failed`."""
     try:
-        return localize_image(map_, picture, cameras, rig_from_cams, turns, near=near)
+        return localize_image(scene_map, image, cameras, rig_from_cams, turns, near=near)
     except CameraError:
         raise
     except ImageError as error:
@@ -63,7 +63,7 @@ def _localize(
 
 @fixed_sums
 def localize_sequence(
-    map_: Map,
+    scene_map: Map,
     images: Sequence[Images],
     cameras: Cameras | Sequence[Cameras],
     odometry: Odometry,
@@ -71,22 +71,22 @@ def localize_sequence(
     rig_from_cams: NDArray[np.float64] | None = None,
     turns: Sequence[int] | None = None,
 ) -> LocalizedFrames:
-    """Localize the N frames of a recording, with and without pictures.
+    """Localize the N frames of a recording, with and without images.
 
     Args:
-        map_: an open map, see `Map.open`.
-        images: for each frame its picture, the C pictures of a rig, or None.
-        cameras: the intrinsics of all pictures, or a list with those of each of the N frames, because they may change
+        scene_map: an open map, see `Map.open`.
+        images: for each frame its image, the C images of a rig, or None.
+        cameras: the intrinsics of all images, or a list with those of each of the N frames, because they may change
             when a phone focuses. For a rig, each is a sequence of C.
         odometry: the device's own poses of the N frames. Losses of tracking are detected.
         settings: see `SequenceSettings`; a dict holds values that differ from the defaults. If `online`, only frames
-            with a picture get a pose, estimated from the frames before them.
+            with an image get a pose, estimated from the frames before them.
         rig_from_cams, turns: see `localize_image`.
 
     Raises:
         ValueError: the numbers of images and poses differ, or there is neither one camera nor one per image.
         ManifestError: GTSAM is not installed.
-        CameraError: a camera is missing, or does not fit the pictures. A picture that cannot be read is `failed`.
+        CameraError: a camera is missing, or does not fit the images. An image that cannot be read is `failed`.
     """
     settings = SequenceSettings.of(settings)
     if len(images) != len(odometry):
@@ -98,9 +98,9 @@ def localize_sequence(
         raise ValueError(
             f"Found {len(cams_of_frames)} cameras and {len(images)} images: expected one for all, or one per image."
         )
-    localize = partial(_localize, map_, rig_from_cams, turns)
+    localize = partial(_localize, scene_map, rig_from_cams, turns)
     single = {frame: localize(image, cams_of_frames[frame]) for frame, image in enumerate(images) if image is not None}
-    piece, again = np.zeros(len(odometry), int), dict[int, QueryResult]()
+    piece, relocalized = np.zeros(len(odometry), int), dict[int, QueryResult]()
     placed = list[PlacedPiece]()
     pieces, queries = odometry.split(), queries_of(single)
     if not settings.online:
@@ -114,12 +114,12 @@ def localize_sequence(
         piece[rows] = number
         frames = np.array([frame for frame in single if rows.start <= frame < rows.stop], np.int64)
 
-        def localize_again(todo: Sequence[tuple[int, RoughPose]], start: int = rows.start) -> list[QueryResult]:
+        def relocalize(todo: Sequence[tuple[int, RoughPose]], start: int = rows.start) -> list[QueryResult]:
             return [localize(images[start + frame], cams_of_frames[start + frame], near) for frame, near in todo]
 
-        relocalize = localize_again if settings.relocalize else None
-        done = localize_piece(odometry.part(rows), queries.part(rows), frames - rows.start, settings, relocalize)
-        again |= {rows.start + frame: estimate for frame, estimate in done.again.items()}
+        again = relocalize if settings.relocalize else None
+        done = localize_piece(odometry.part(rows), queries.part(rows), frames - rows.start, settings, again)
+        relocalized |= {rows.start + frame: estimate for frame, estimate in done.relocalized.items()}
         placed.append(done.placed)
     return LocalizedFrames(
         np.concatenate([np.zeros((0, 4, 4)), *(part.world_from_rig for part in placed)]),
@@ -127,36 +127,36 @@ def localize_sequence(
         np.concatenate([np.zeros(0, object), *(part.status for part in placed)]),
         piece,
         single,
-        again,
+        relocalized,
     )
 
 
 class SequenceLocalizer:
     """Localizes a moving device frame by frame, from the current and earlier frames.
 
-    Each picture solves the pose graph of the last `settings.length_s` seconds (None: of the whole piece). With 600
-    frames this takes some 50 ms, besides localization of the picture. Between pictures, odometry continues the last
+    Each image solves the pose graph of the last `settings.length_s` seconds (None: of the whole piece). With 600
+    frames this takes some 50 ms, besides localization of the image. Between images, odometry continues the last
     solution.
     """
 
     def __init__(
         self,
-        map_: Map,
+        scene_map: Map,
         settings: SequenceSettings | dict[str, Any] | None = None,
         rig_from_cams: NDArray[np.float64] | None = None,
         turns: Sequence[int] | None = None,
     ) -> None:
         """See `localize_sequence`; `settings.length_s` is the window."""
         self.settings = self._drift = SequenceSettings.of({"online": True}, settings)
-        self._localize = partial(_localize, map_, rig_from_cams, turns)
+        self._localize = partial(_localize, scene_map, rig_from_cams, turns)
         self._motion = Odometry(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
         """Frames of the window."""
         self._queries = queries_of({})
         """Single poses of the current piece, including those found again."""
         self._solved: tuple[int, PlacedPiece] | None = None
-        """Frame of the last picture, and the solution there."""
+        """Frame of the last image, and the solution there."""
         self.single: QueryResult | None = None
-        """Estimate from the latest frame's picture alone; None if it had no picture."""
+        """Estimate from the latest frame's image alone; None if it had no image."""
 
     @fixed_sums
     def add(
@@ -167,12 +167,12 @@ class SequenceLocalizer:
         Args:
             timestamp: microseconds, later than the last one.
             odom_from_rig: (4, 4) pose by the device's odometry; with a single camera, odom_from_cam.
-            image: the frame's picture, or a sequence of pictures of a rig; None: odometry only.
+            image: the frame's image, or a sequence of images of a rig; None: odometry only.
             cameras: the intrinsics; a sequence for a rig.
 
         Raises:
             ValueError: the timestamp is not later than the last one, or the pose is invalid.
-            CameraError: a camera is missing, or does not fit the picture. A picture that cannot be read is `failed`.
+            CameraError: a camera is missing, or does not fit the image. An image that cannot be read is `failed`.
             ManifestError: GTSAM is not installed.
         """
         pose = np.asarray(odom_from_rig, np.float64)
@@ -205,17 +205,17 @@ class SequenceLocalizer:
         self._drop_before(cut(self._motion, self._queries, self._drift)[-1].start)
         offline = self._drift.model_copy(update={"online": False, "length_s": None})
 
-        def localize_again(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
+        def relocalize(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
             return [self._localize(image, cameras, near) for _, near in todo]
 
-        again = localize_again if self.settings.relocalize else None
+        again = relocalize if self.settings.relocalize else None
         done = localize_piece(self._motion, self._queries, np.array([len(self._motion) - 1]), offline, again)
         self._queries, placed = done.queries, done.placed
         self._solved = len(self._motion) - 1, placed
         return self._estimate(placed.world_from_rig[-1], placed.covariances[-1], str(placed.status[-1]))
 
     def _extrapolate(self) -> QueryResult:
-        """Return the pose of the latest frame by odometry from the last picture."""
+        """Return the pose of the latest frame by odometry from the last image."""
         if self._solved is None:
             return QueryResult.failed("no query of this piece has a pose", found_by="sequence")
         last, placed = self._solved

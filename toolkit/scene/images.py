@@ -91,7 +91,7 @@ def localize_images(
             if sure_px is not None:
                 continue
             result = unknown.locate(focal_px)
-            if result.status.rank >= results[number].status.rank and not result.misfit:
+            if result.status.rank >= results[number].status.rank and not result.camera_contradicted:
                 text = f"focal length {focal_px:.0f} px, from {len(sure)} other photographs of its camera"
                 results[number] = replace(result, remark="; ".join(filter(None, [text, result.remark])))
     return results
@@ -137,7 +137,7 @@ class _UnknownFocal:
         others: list[tuple[float, ...]] = [(focal_px * FOCAL_DOUBT, 0.0, 0.0), (focal_px / FOCAL_DOUBT, 0.0, 0.0)]
         if self.cropped:
             others += [(focal_px, *(sign * CENTER_DOUBT)) for sign in (*np.eye(2), *-np.eye(2))]
-        if result.status == Status.OK and not all(self.locate(*other).misfit for other in others):
+        if result.status == Status.OK and not all(self.locate(*other).camera_contradicted for other in others):
             result = replace(result, status=Status.LOW_CONFIDENCE, reason=CAMERA)
             text += ", as other intrinsics do" if told else ", and the matches do not tell it"
         self.described = None

@@ -58,7 +58,7 @@ from toolkit.pose.local_triangulation import OnDemandLocalizer, PosedImages
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import RIVAL_DISTANCE, PnpLocalizer, bounded_by_rivals, clarity_of_support
 from toolkit.prediction.feed_forward import FeedForwardLocalizer, depth_of_images
-from toolkit.prediction.hybrid import MOST_FEATURES, DepthLifter, HybridLocalizer, lifts
+from toolkit.prediction.hybrid import MAX_FEATURES, DepthLifter, HybridLocalizer, lifts
 from toolkit.prediction.interface import Predictor
 from toolkit.prediction.network import open_predictor
 from toolkit.results.metrics import UNKNOWN_UNIT, length_unit
@@ -88,7 +88,7 @@ log = logging.getLogger(__name__)
 WITHOUT_FEATURES = ("feed_forward", "nearest")
 """Methods that need no local features of the queries."""
 NEAR, NEAR_DEG = 10.0, 60.0
-"""Largest distance (in map lengths, see `Survey.length`) and angle (degrees) between a camera and a map image that may
+"""Largest distance (map lengths, see `LocalMap.length`) and angle (degrees) between a camera and a map image that may
 show the same scene."""
 MAX_SURE_STD_M = 0.05
 """An `ok` pose with at most this standard deviation of the position, meters, is precise enough. Otherwise the fallback
@@ -368,7 +368,7 @@ class Map:
 
     def is_unsure(self, result: QueryResult) -> bool:
         """Tell whether fallback features, if there are any, might find a better pose."""
-        if self.fallback is None or result.misfit or result.reason == NOISE:  # no features repair that
+        if self.fallback is None or result.camera_contradicted or result.reason == NOISE:  # no features repair that
             return False
         limit = MAX_SURE_STD_M * (1.0 if self.settings.unit else self.length)
         # A pose without matches has no deviation (NaN) and counts as precise.
@@ -466,8 +466,8 @@ class Map:
         result = replace(result, images=images, found_by=method or self.settings.method)
         if self.consistency.trusted or not posed:
             return result
-        # In such a map, a misfit says nothing about the query's camera, and what is called noise has another cause.
-        blamed = result.misfit or result.reason == NOISE
+        # There, a contradiction says nothing about the query's camera, and what is called noise has another cause.
+        blamed = result.camera_contradicted or result.reason == NOISE
         remark = "; ".join(filter(None, ["" if blamed else result.remark, self.consistency.text]))
         what = "poses" if self.consistency.verdict == "inconsistent" else "intrinsics"
         reason = f"the {what} of the map contradict its images"
@@ -538,7 +538,7 @@ class Map:
         if not settings.predicts:
             if lifts(settings, self.session):
                 of_image = depth_of_images(self.session, pnp.image_names, self.length)
-                pnp.lift = DepthLifter(pnp, of_image, MOST_FEATURES).localize
+                pnp.lift = DepthLifter(pnp, of_image, MAX_FEATURES).localize
             return pnp
         predictor = self.predictor or open_predictor(settings, self.capture, self.map_dir)
         unit = ("m", 1 / self.length) if self.settings.unit else (UNKNOWN_UNIT, 1.0)
@@ -645,7 +645,7 @@ class Map:
 
     @property
     def length(self) -> float:
-        """The length that localizers treat as one meter, in the unit of the poses; see `Survey.length`."""
+        """The length that localizers treat as one meter, in the unit of the poses; see `LocalMap.length`."""
         return self._first.length if self._first else 1.0
 
     @cached_property
@@ -761,7 +761,7 @@ class ReferenceSearch:
 
     def _inputs(self, embedder: Embedder, query: Query, kinds: Sequence[LocalMethod]) -> list[Any]:
         if embedder.inputs != "features":
-            turned, side = shows_upright(embedder, self.embed_settings.upright), embedder.least_side
+            turned, side = shows_upright(embedder, self.embed_settings.upright), embedder.min_side
             images = (turn_image(view.read(True, side), view.turns if turned else 0) for view in query.views)
             return [embedder.prepare(image) for image in images]
         sift, settings = self._sift, [kind.extractor.settings for kind in kinds]

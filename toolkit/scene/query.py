@@ -359,7 +359,7 @@ def what_if(
         retrieved.take(~np.isin(retrieved.images, dropped) & ~np.isin(np.arange(len(retrieved.images)), at))
         for retrieved in found
     ]
-    again = other.locate(query, near, [_in(other, scene_map, retrieved) for retrieved in found])
+    relocalized = other.locate(query, near, [_in(other, scene_map, retrieved) for retrieved in found])
     said = {
         "references": references,
         "drop": list(drop),
@@ -368,7 +368,7 @@ def what_if(
         "near": near and "a rough pose",
     }
     before, retrieved = result.show(), ranks(scene_map, found)
-    after = replace(before, result=again, settings=other.settings, views=query.views, retrieved=retrieved)
+    after = replace(before, result=relocalized, settings=other.settings, views=query.views, retrieved=retrieved)
     return Comparison(before, after, {**changes, **{name: value for name, value in said.items() if value}})
 
 

@@ -149,7 +149,7 @@ class InspectedPair:
         """
         pairs = {pair_devices(path.stem): path for path in sorted(Path(poses_dir).glob("*_map_*_query_*.h5"))}
         if (map_device, query_device) not in pairs:
-            known = [f"{query} in {map_}" for map_, query in pairs]
+            known = [f"{query} in {mapped}" for mapped, query in pairs]
             raise ArtifactError(
                 f"{poses_dir}: no correspondences of queries of {query_device!r} in the map of {map_device!r}, "
                 f"`<pair>.h5`. {nearest(f'{query_device} in {map_device}', known)} Localize first: "
@@ -482,10 +482,10 @@ class Run:
         """
         queries = self.queries
         if not len(queries):
-            place = self.map(map_device, scene)
-            session = place.session
+            scene_map = self.map(map_device, scene)
+            session = scene_map.session
             middle = session.images[["timestamp"]].assign(device_id=session.device_ids).iloc[[len(session) // 2]]
-            return place.query_of_session(session, session.rows_of_keyframes(middle)[0])
+            return scene_map.query_of_session(session, session.rows_of_keyframes(middle)[0])
         of_map = queries[(queries["map_device"] == map_device) & (queries["scene"] == self._scene(scene))]
         status = statuses(of_map["status"])
         of_map = of_map.assign(sure=status == str(Status.OK))[status != str(Status.FAILED)]

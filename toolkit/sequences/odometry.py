@@ -18,7 +18,7 @@ from toolkit.capture import Session, Trajectory
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import SequenceSettings
 
-LEAST_STD_M, LEAST_STD_DEG = 0.001, 0.005
+MIN_STD_M, MIN_STD_DEG = 0.001, 0.005
 """Standard deviation by axis that is added to each single pose, whose covariance has the noise of the map already.
 With ten times as much, odometry pulled the poses of an exact map by 0.5 mm in the median, twice their error."""
 JUMP_M, JUMP_DEG = 0.2, 20.0
@@ -39,9 +39,9 @@ _SHARE, _CHI2_3 = 0.25, 1.213
 """A probability, and that quantile of the chi-squared distribution with 3 degrees of freedom."""
 _PAIRS = 1 << 18
 """Pairs of queries that are compared at a time, to limit memory."""
-_LEAST_MOTIONS = 6
+_MIN_MOTIONS = 6
 """Fewer motions do not determine the drift."""
-_MOST_DRIFT = 20.0
+_MAX_DRIFT = 20.0
 """Largest factor on the drift of the settings. More means that this is no odometry, or most single poses are wrong."""
 
 
@@ -214,12 +214,12 @@ def vote_weights(ok: NDArray[np.bool_], p_correct: Floats, rival_support: Floats
 
 
 def bounded(covariances: Floats) -> Floats:
-    """Return covariances (n, 6, 6) of poses plus the variance of errors of the map, `LEAST_STD_M`, `LEAST_STD_DEG`.
+    """Return covariances (n, 6, 6) of poses plus the variance of errors of the map, `MIN_STD_M`, `MIN_STD_DEG`.
 
     No direction gets a larger variance than `UNKNOWN_COVARIANCE` has. A pose whose depth is open by 50 m, for example,
     is known to 0.1 mm in other directions, and the graph's linear system would be singular in float64.
     """
-    least = np.repeat([np.deg2rad(LEAST_STD_DEG), LEAST_STD_M], 3) ** 2
+    least = np.repeat([np.deg2rad(MIN_STD_DEG), MIN_STD_M], 3) ** 2
     most, limited = UNKNOWN_COVARIANCE.max(), covariances.copy()
     for row in np.flatnonzero(np.trace(covariances, axis1=1, axis2=2) > most):
         variances, directions = np.linalg.eigh(covariances[row])
@@ -348,7 +348,7 @@ def with_measured_drift(
     """
     sure = [(odometry, queries.choose(queries.trusted)) for odometry, queries in pieces]
     # Few motions: add pairs that are two queries apart. They tell more of the rotation and less of the position drift.
-    lags = (1,) if sum(max(len(queries) - 1, 0) for _, queries in sure) >= _LEAST_MOTIONS else (1, 2)
+    lags = (1,) if sum(max(len(queries) - 1, 0) for _, queries in sure) >= _MIN_MOTIONS else (1, 2)
     values = settings.model_dump()
     for name, turns in (("rotation_drift_deg", True), ("position_drift", False)):
         ratios = [np.zeros(0)]  # drift variance of each motion, relative to that of the settings
@@ -359,8 +359,8 @@ def with_measured_drift(
             drift2 = off.drift[0 if turns else 1] ** 2
             ratios.append((square / _CHI2_3 - other_var)[drift2 > 0] / drift2[drift2 > 0])
         joined = np.concatenate(ratios)
-        factor = float(np.sqrt(max(1.0, np.quantile(joined, _SHARE)))) if len(joined) >= _LEAST_MOTIONS else 1.0
-        values[name] *= min(factor, _MOST_DRIFT)
+        factor = float(np.sqrt(max(1.0, np.quantile(joined, _SHARE)))) if len(joined) >= _MIN_MOTIONS else 1.0
+        values[name] *= min(factor, _MAX_DRIFT)
     return settings.model_copy(update=values)
 
 

@@ -191,7 +191,7 @@ class LocalizedPiece:
     placed: PlacedPiece
     queries: PosedQueries
     """The single poses of the final graph: the first ones and those found again."""
-    again: Mapping[int, QueryResult]
+    relocalized: Mapping[int, QueryResult]
     """Estimates of the queries that were localized again near their predicted pose, by frame."""
     steps: Mapping[str, Floats]
     """world_from_rig (A, 4, 4) of the query frames after each of `STEPS`, NaN for none."""
@@ -208,22 +208,22 @@ def localize_piece(
     queries: PosedQueries,
     query_frames: Ints,
     settings: SequenceSettings,
-    again: Relocalize | None = None,
+    relocalize: Relocalize | None = None,
 ) -> LocalizedPiece:
     """Return the poses of a piece of odometry: of all frames, or only of the queries if `settings.online`.
 
     Of all `query_frames` (A,), ascending, those in `queries` have a pose. Those that are not `ok` or do not fit the
-    graph are localized `again`; None: they keep their poses. Raise ManifestError if GTSAM is not installed.
+    graph are localized by `relocalize`; None: they keep their poses. Raise ManifestError if GTSAM is not installed.
     """
     first = _placed(odometry, queries, query_frames, settings)
     sure = queries.frames[first.used & queries.trusted]
     predicted = query_frames[np.isfinite(first.world_from_rig[query_frames]).all(axis=(1, 2))]
     doubtful = np.setdiff1d(predicted, sure).tolist()
     relocalized: dict[int, QueryResult] = {}
-    if again is not None and doubtful:
+    if relocalize is not None and doubtful:
         stds = zip(*(each.tolist() for each in stds_of(first.covariances[doubtful])), strict=True)
         rough = [RoughPose(pose, *std) for pose, std in zip(first.world_from_rig[doubtful], stds, strict=True)]
-        relocalized = dict(zip(doubtful, again(list(zip(doubtful, rough, strict=True))), strict=True))
+        relocalized = dict(zip(doubtful, relocalize(list(zip(doubtful, rough, strict=True))), strict=True))
     all_queries = with_relocalized(queries, relocalized)
     second = first if all_queries is queries else _placed(odometry, all_queries, query_frames, settings)
     singles = np.full((len(odometry), 4, 4), np.nan)

@@ -22,9 +22,9 @@ HDF5_ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, Overfl
 """Errors of HDF5 and h5py for files that are torn, of another format, or with content that numpy does not support."""
 CHECKSUM = "xxh3"
 """Attribute of a group: XXH3 of its name and arrays. Files of other tools lack it."""
-MOST_BYTES = 1 << 26
+MAX_BYTES = 1 << 26
 """Memory limit for the arrays of a group, bytes; a larger file may fill as much memory as its own size."""
-MOST_TEXTS = 1 << 12
+MAX_TEXTS = 1 << 12
 """Limit of texts in an array."""
 
 
@@ -55,7 +55,7 @@ def read_group(file: h5py.File, name: str) -> dict[str, NDArray[Any]]:
         group = _open_owned(file, name)
         if not isinstance(group, h5py.Group):
             raise ValueError("it is not a group")
-        room, arrays = max(MOST_BYTES, file.id.get_filesize()), dict[str, NDArray[Any]]()
+        room, arrays = max(MAX_BYTES, file.id.get_filesize()), dict[str, NDArray[Any]]()
         for key in group:
             item = _open_owned(group, key)
             if isinstance(item, h5py.Dataset):
@@ -88,8 +88,8 @@ def _bytes_of(item: h5py.Dataset) -> int:
         raise ValueError("its data are in another file")
     count = math.prod(item.shape or ())
     if h5py.check_string_dtype(item.dtype) is not None:
-        if count > MOST_TEXTS:
-            raise ValueError(f"it has {count} texts in an array; expected at most {MOST_TEXTS}")
+        if count > MAX_TEXTS:
+            raise ValueError(f"it has {count} texts in an array; expected at most {MAX_TEXTS}")
     elif item.shape is None or item.dtype.kind not in "biuf":
         raise ValueError(f"it has an array of the type {item.dtype}; expected numbers or texts")
     return int(count * item.dtype.itemsize)

@@ -76,12 +76,12 @@ class Items(Mapping[str, dict[str, NDArray[Any]]]):
     Reading is thread-safe; one thread adds items. They can be read when the context ends, or after `flush`.
     """
 
-    def __init__(self, folder: str | Path, made_by: Any = None, again: bool = False, since: int = 0) -> None:
+    def __init__(self, folder: str | Path, made_by: Any = None, skip_existing: bool = True, since: int = 0) -> None:
         """Open a folder, which need not exist.
 
         Args:
             made_by: settings, JSON, stored with new items; None: those of the items that are there.
-            again: make all items again: `left` returns also those that are there.
+            skip_existing: False: make all items again; `left` returns also those that are there.
             since: number of the first shard whose items need not be made again, for a worker.
         """
         self.folder, self.made_by = Path(folder), made_by
@@ -90,7 +90,7 @@ class Items(Mapping[str, dict[str, NDArray[Any]]]):
         self._added: dict[str, tuple[str, Any, bytes]] = {}
         self._bytes, self._written = 0, time.monotonic()
         self.refresh()
-        self._since = self._next_number() if again else since
+        self._since = since if skip_existing else self._next_number()
 
     def refresh(self) -> None:
         """Find the shards that this and other processes have written since."""
@@ -160,7 +160,7 @@ class Items(Mapping[str, dict[str, NDArray[Any]]]):
         """Return the items that are not there yet, or were made from other sources."""
         return [item for item in items if not self.is_current(item[0], item[1])]
 
-    def spread(
+    def distribute(
         self, function: Callable[..., object], items: Sequence[Item], arguments: tuple[Any, ...], label: str, unit: str,
         multiple: int = 1,
     ) -> list[Item]:  # fmt: skip
@@ -260,7 +260,7 @@ def remove_items(path: Path) -> None:
     shutil.rmtree(items_beside(path), ignore_errors=True)
 
 
-def heals(stage: Callable[P, Result]) -> Callable[P, Result]:
+def retry_damaged(stage: Callable[P, Result]) -> Callable[P, Result]:
     """Decorate a stage: if it finds damaged items, drop them and call it again, which makes them; once a folder."""
 
     @wraps(stage)
@@ -280,7 +280,7 @@ def heals(stage: Callable[P, Result]) -> Callable[P, Result]:
 
 def _do_share(folder: Path, made_by: Any, since: int, items: Sequence[Item], function: Callable[..., object],
               arguments: tuple[Any, ...]) -> None:  # fmt: skip
-    """Do a share of `Items.spread` on a worker."""
+    """Do a share of `Items.distribute` on a worker."""
     with Items(folder, made_by, since=since) as opened:
         function(opened, opened.left(items), *arguments)
 

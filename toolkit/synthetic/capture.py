@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from toolkit.capture import Trajectory
 
 RATE_HZ = 5.0  # of odometry
-PICTURE_S = 1.4  # between two images of a recording without a given length
+IMAGE_PERIOD_S = 1.4  # between two images of a recording without a given length
 GAP_S = 4.0  # length of a gap in odometry
 WIFI_S, BLUETOOTH_S = 4.0, 1.0  # between two scans
 SCAN_US = 600_000  # duration of a WiFi scan
@@ -350,7 +350,7 @@ class World(DemoData):
     @property
     def hours(self) -> int:
         """Whole hours that are long enough for one subsession."""
-        return 1 + int(max(PICTURE_S * self.rooms * (self.frames + 8), self.seconds) / 3600)
+        return 1 + int(max(IMAGE_PERIOD_S * self.rooms * (self.frames + 8), self.seconds) / 3600)
 
     @property
     def stay_s(self) -> float:
@@ -366,23 +366,23 @@ class World(DemoData):
         return build_room(self.seed, index, self.look(index))
 
 
-def _night(picture: Image, rng: Rng) -> Image:
-    """Underexpose a picture, with the noise of a high gain."""
-    return np.clip(0.05 * picture + 4 * rng.standard_normal(picture.shape) + 0.5, 0, 255).astype(np.uint8)
+def _night(image: Image, rng: Rng) -> Image:
+    """Underexpose an image, with the noise of a high gain."""
+    return np.clip(0.05 * image + 4 * rng.standard_normal(image.shape) + 0.5, 0, 255).astype(np.uint8)
 
 
-def shaken(picture: Any, length: int, angle: float = 0.3) -> Any:
-    """Blur a picture along a line of `length` pixels, at an angle (radians) from the horizontal."""
+def shaken(image: Any, length: int, angle: float = 0.3) -> Any:
+    """Blur an image along a line of `length` pixels, at an angle (radians) from the horizontal."""
     reach = 0.5 * (length - 1) * np.array([np.cos(angle), np.sin(angle)])
     middle, kernel = length // 2, np.zeros((length, length), np.float32)
     start, end = (np.round(middle + side * reach).astype(int).tolist() for side in (-1, 1))
     cv2.line(kernel, start, end, 1.0)
-    return cv2.filter2D(picture, -1, kernel / kernel.sum())
+    return cv2.filter2D(image, -1, kernel / kernel.sum())
 
 
 HARD: dict[str, Callable[[Image, Rng], Image] | None] = {
     "night": _night,
-    "blurred": lambda picture, _: shaken(picture, 33),
+    "blurred": lambda image, _: shaken(image, 33),
     "two-places": None,
     "torn": None,
     "wrong-focal": None,
@@ -493,7 +493,7 @@ def _plan_room(world: World, scene: Scene, index: int, tables: dict[str, Tables]
                     offset_s = world.stay_s * (1.5 * index + (i + rng.uniform(0.2, 0.8)) / len(bodies))
                     timestamp = start + int(1e6 * offset_s)
                 else:
-                    offset_s = 5 + PICTURE_S * (index * (world.frames + 8) + i)
+                    offset_s = 5 + IMAGE_PERIOD_S * (index * (world.frames + 8) + i)
                     timestamp = start + int(1e6 * offset_s + rng.integers(0, 700_000))
                 zoom = float(np.round(rng.normal(1, 0.004), 5))
                 device_id, body_from_device = table.add_frame(name, device, subsession, timestamp, zoom)
@@ -515,19 +515,19 @@ def _plan_room(world: World, scene: Scene, index: int, tables: dict[str, Tables]
 def _take(shot: Shot, quads: list[Quad], rays: Rays | None, sessions: Path, seed: int) -> None:
     """Render one image with its device's exposure, tint and noise, and its depth, into the session's raw_data."""
     device = shot.device
-    picture, depth = render(quads, shot.world_from_cam, rays or Rays.of(shot.camera), device.gray)
+    rendered, depth = render(quads, shot.world_from_cam, rays or Rays.of(shot.camera), device.gray)
     h, w = depth.shape
     y, x = np.ogrid[0:h, 0:w]
     radius2 = ((x - w / 2) ** 2 + (y - h / 2) ** 2).astype(np.float32) / ((w / 2) ** 2 + (h / 2) ** 2)
     # Exposure compensates for the scene's brightness only in part, like a camera that must not flicker.
-    gain = (device.brightness / max(float(picture.mean()), 20.0)) ** 0.7
-    picture = np.clip(picture * (gain / 255), 0, None) ** device.gamma * 255
-    picture *= (1 - device.vignette * radius2).reshape(h, w, *[1] * (picture.ndim - 2))
+    gain = (device.brightness / max(float(rendered.mean()), 20.0)) ** 0.7
+    rendered = np.clip(rendered * (gain / 255), 0, None) ** device.gamma * 255
+    rendered *= (1 - device.vignette * radius2).reshape(h, w, *[1] * (rendered.ndim - 2))
     if not device.gray:
-        picture *= np.asarray(device.tint, np.float32)
+        rendered *= np.asarray(device.tint, np.float32)
     rng = named_rng(seed, "noise", shot.sensor_id, str(shot.timestamp))
-    noise = device.noise * rng.standard_normal(picture.shape, np.float32)
-    image = np.clip(picture + noise + 0.5, 0, 255).astype(np.uint8)
+    noise = device.noise * rng.standard_normal(rendered.shape, np.float32)
+    image = np.clip(rendered + noise + 0.5, 0, 255).astype(np.uint8)
     raw = sessions / shot.session / "raw_data"
     save_image(raw / shot.path, image, [cv2.IMWRITE_JPEG_QUALITY, device.quality])
     if shot.depth_path is not None:
@@ -558,7 +558,7 @@ def _add_hard(sessions: Path, world: World, table: Tables, elsewhere: Scene) -> 
     there = world.queries - world.queries // 2
     way = [*range(there), *reversed(range(there, world.queries))]
     for number, (name, worsen) in enumerate(HARD.items()):
-        timestamp = start + round(1e6 * (PICTURE_S * (number + 1) + (6 if name == "elsewhere" else 0)))
+        timestamp = start + round(1e6 * (IMAGE_PERIOD_S * (number + 1) + (6 if name == "elsewhere" else 0)))
         (_, _, *sensor), pose, source = easy[way[number % len(way)]]
         sensor_id = f"{subsession}/{'cam_wide' if name == 'wrong-focal' else 'cam_phone'}_{timestamp}"
         path = f"{subsession}/images/{timestamp}-{name}.jpg"
@@ -572,15 +572,15 @@ def _add_hard(sessions: Path, world: World, table: Tables, elsewhere: Scene) -> 
         else:
             if name == "wrong-focal":
                 sensor[4:6] = [round(WRONG_FOCAL * focal, 3) for focal in sensor[4:6]]
-            picture = cv2.imread(str(raw / source))
-            assert picture is not None
+            image = cv2.imread(str(raw / source))
+            assert image is not None
             if worsen is not None:
-                picture = worsen(picture, named_rng(world.seed, "hard", name))
+                image = worsen(image, named_rng(world.seed, "hard", name))
             if name == "two-places":
-                half, other = picture.shape[1] // 2, cv2.imread(str(raw / easy[-1][2]))
+                half, other = image.shape[1] // 2, cv2.imread(str(raw / easy[-1][2]))
                 assert other is not None
-                picture[:, half:] = other[:, half:]
-            save_image(raw / path, picture, [cv2.IMWRITE_JPEG_QUALITY, device.quality])
+                image[:, half:] = other[:, half:]
+            save_image(raw / path, image, [cv2.IMWRITE_JPEG_QUALITY, device.quality])
             if name == "torn":
                 whole = (raw / path).read_bytes()
                 (raw / path).write_bytes(whole[: len(whole) // 3])
@@ -595,8 +595,8 @@ def _poses_between(table: Tables, world: World, name: str) -> list[tuple[int, st
     for recording, start in table.subsessions.items():
         rows = sorted((row for row in table.poses if row[1].startswith(f"{recording}/")), key=lambda row: row[:2])
         device_ids = {time: device_id for time, device_id, _ in rows}
-        times, pictured_poses = np.array([row[0] for row in rows]), np.stack([row[2] for row in rows])
-        for time_us, pose in zip(*every_frame(times, pictured_poses, start, world.seconds), strict=True):
+        times, image_poses = np.array([row[0] for row in rows]), np.stack([row[2] for row in rows])
+        for time_us, pose in zip(*every_frame(times, image_poses, start, world.seconds), strict=True):
             if int(time_us) not in device_ids:
                 device_ids[int(time_us)] = table.add_frame(name, DEVICES[name], recording, int(time_us))[0]
             poses.append((int(time_us), device_ids[int(time_us)], pose))
@@ -613,7 +613,7 @@ def _write_session(path: Path, world: World, table: Tables, rooms: list[Scene]) 
     from toolkit.capture import Trajectory
 
     name, _, split = path.name.rpartition("_")
-    pictured = sorted(row[:2] for row in table.poses)
+    with_image = sorted(row[:2] for row in table.poses)
     long = world.seconds > 0 and split == "query"
     poses = sorted(_poses_between(table, world, name) if long else table.poses, key=lambda row: row[:2])
     times, ids = np.array([row[0] for row in poses], np.int64), [row[1] for row in poses]
@@ -631,12 +631,12 @@ def _write_session(path: Path, world: World, table: Tables, rooms: list[Scene]) 
             scanned.setdefault(kind, []).extend(scans(rng, times[rows], measured[rows], emitters, rooms, sensor_id))
         if split == "query":  # in a map session of few images, some pieces of odometry would contain no image
             rng, device = named_rng(world.seed, "odometry", recording), DEVICES[name]
-            parts = PICTURE_S * RATE_HZ if long else 1.0
+            parts = IMAGE_PERIOD_S * RATE_HZ if long else 1.0
             kept[rows], measured[rows] = tracked(
                 rng, times[rows], measured[rows], device.drift, parts, world.losses, world.gaps
             )
     odometry = Trajectory.from_poses(times[kept], np.array(ids, object)[kept].tolist(), measured[kept])
-    frames = pd.DataFrame(pictured, columns=["timestamp", "device_id"])
+    frames = pd.DataFrame(with_image, columns=["timestamp", "device_id"])
     # Hard images are the last ones, and all of them are queries.
     hard = np.arange(len(frames)) >= len(frames) - len(HARD) * (world.hard and path.name == "ios_query")
     pruned = frames[(np.arange(len(frames)) % 6 != 5) | hard]

@@ -88,7 +88,7 @@ def arrange(path: str | Path, out: str | Path, scenes: tuple[str, ...] = SCENES,
     Two photographs of five are queries, interleaved along the path. With `hard`, two of three are, and they are by
     night: dark but for a pool of light, blurred by motion, noisy, zoomed in, turned by some degrees, and partly hidden.
     `path` has the scenes' folders, each with images/ and gt_dense_cameras/; the origins of their worlds are put 100 m
-    apart. The same seed gives the same poses and the same pictures. Raise CaptureError if a scene or a file of it is
+    apart. The same seed gives the same poses and the same images. Raise CaptureError if a scene or a file of it is
     missing or malformed, or `out` exists.
     """
     out = Path(out)

@@ -519,7 +519,7 @@ def render(quads: list[Quad], world_from_cam: Floats, rays: Rays, gray: bool) ->
             np.copyto(nearest[area], q, where=inside)
             np.copyto(owner[area], np.int16(k), where=inside)
             visible[k] = area, linear, distance
-    picture = np.zeros((height * width, 1 if gray else 3), np.uint8)
+    image = np.zeros((height * width, 1 if gray else 3), np.uint8)
     samples = np.arange(height * width).reshape(height, width)
     offsets = np.tile(OFFSETS, (height // SAMPLES, width // SAMPLES)).ravel()
     focal = SAMPLES * (rays.camera.focal_length_x * rays.camera.focal_length_y) ** 0.5
@@ -543,10 +543,10 @@ def render(quads: list[Quad], world_from_cam: Floats, rays: Rays, gray: bool) ->
             if not len(rows):
                 continue
             lx, ly = tw / quad.width / 2.0**i, th / quad.height / 2.0**i
-            picture[index[rows]] = _texture(pyramid[i], s[rows] * np.float32(lx), t[rows] * np.float32(ly))
+            image[index[rows]] = _texture(pyramid[i], s[rows] * np.float32(lx), t[rows] * np.float32(ly))
     size = (width // SAMPLES, height // SAMPLES)
-    picture = picture.reshape(height, width, -1).astype(np.float32)
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA), _depth(quads, owner, nearest)
+    image = image.reshape(height, width, -1).astype(np.float32)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA), _depth(quads, owner, nearest)
 
 
 def _depth(quads: list[Quad], owner: Image, nearest: Image) -> Image:

@@ -203,7 +203,7 @@ def painting(rng: Rng, h: int, w: int, ppm: float) -> Image:
 
 
 def wood(rng: Rng, h: int, w: int, ppm: float, color: Any = (60, 100, 145)) -> Image:
-    """Boards with grain along the picture's x."""
+    """Boards with grain along the image's x."""
     image = _painted(color, 0.16 * _noise(rng, h, w, (2, 6), 14) + 0.08 * _noise(rng, h, w, (12,), 8))
     for y in range(0, h, max(8, int(0.16 * ppm))):
         image[y : y + 2] = _f(color) * 0.45
