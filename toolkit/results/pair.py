@@ -177,9 +177,8 @@ class PairResults:
         try:
             return QueryResult.from_arrays(read_group(self._file, name))
         except (*HDF5_ERRORS, AttributeError) as error:
-            raise DamagedError(
-                self.h5, f"{self.h5}: {name} is not as a run writes it ({first_line(error)}). Localize again."
-            ) from None
+            fault = f"{self.h5}: {name} is not as a run writes it ({first_line(error)}). Localize again."
+            raise DamagedError(self.h5, fault) from None
 
     def errors(self, truth: Trajectory | Floats) -> pd.DataFrame:
         """Return the table with `rotation_error_deg` and `translation_error_m`, by `metrics.pose_errors`; or `_L`.
@@ -205,9 +204,8 @@ def _open(h5: Path) -> h5py.File:
     try:
         return h5py.File(h5, "r")
     except HDF5_ERRORS as error:
-        raise ArtifactError(
-            f"{h5}: the correspondences of the poses cannot be read ({error}). Localize again."
-        ) from None
+        fault = f"the correspondences of the poses cannot be read ({error})"
+        raise ArtifactError(f"{h5}: {fault}. Localize again.") from None
 
 
 def names_of_maps(h5: Path) -> list[str]:
