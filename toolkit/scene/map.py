@@ -713,9 +713,7 @@ class Located:
         answer: Callable[[QueryResult], "Answer"],
         open_query: Callable[[], tuple[Map, Query, Sequence[References]]],
     ) -> None:
-        """`answer` returns how the query was localized, given one of its results; `open_query` what is needed to do it
-        again.
-        """
+        """`answer` returns how the query was localized, given a result; `open_query` what is needed to do it again."""
         self.answer, self.open = answer, open_query
 
     def __deepcopy__(self, memo: Any) -> "Located":
