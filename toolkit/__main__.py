@@ -33,10 +33,8 @@ try:
         sentence,
     )
 except ModuleNotFoundError as missing:  # users may run `python -m toolkit` with the wrong Python
-    raise SystemExit(
-        f"Error: {sys.executable} has no package {missing.name}. Use the Python that the toolkit is installed for: "
-        ".venv/bin/python -m toolkit, if `make` installed it."
-    ) from None
+    do = "Use the Python that the toolkit is installed for: .venv/bin/python -m toolkit, if `make` installed it."
+    raise SystemExit(f"Error: {sys.executable} has no package {missing.name}. {do}") from None
 
 app = typer.Typer(
     no_args_is_help=True, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
@@ -194,8 +192,7 @@ def localize(
     origin = None
     with suppress(CaptureError):
         origin = origin_of(scene_map.session)
-    rows: list[dict[str, Any]] = []
-    poses: list[Any] = []
+    rows, poses = list[dict[str, Any]](), list[Any]()
     for path, result in zip(photographs, localize_images(scene_map, photographs, given), strict=True):
         row: dict[str, Any] = {"image": str(path), "status": result.status_text, "world_from_cam": None}
         row |= {"inliers": result.num_inliers, "remark": result.remark}
@@ -381,10 +378,7 @@ def demo_data(
 
 
 def importer(name: str, runs_itself: bool = False) -> Callable[[Callable[..., Any]], None]:
-    """Register an import, which returns its report, as a command that also takes the options of all imports.
-
-    It runs itself, or is the function of its name in `exchange.interchange`.
-    """
+    """Register an import, itself or the function of its name in `exchange.interchange`, with the options of all."""
 
     def register(command: Callable[..., Any]) -> None:
         own, shared = inspect.signature(command, eval_str=True), inspect.signature(_shared, eval_str=True)
@@ -564,8 +558,7 @@ def reconstruct(
     *photos, capture = sources
     manifest = _manifest_of(capture)
     tell = partial(print, file=sys.stderr) if as_json else print
-    points: dict[str, Any] = {}
-    option, report = "", None
+    points, option, report = dict[str, Any](), "", None
     if remove:
         tell(remove_recording(remove, capture, device))
     elif (capture / "sessions" / f"{device}_map").exists() and not replace:
@@ -600,10 +593,7 @@ def reconstruct(
 
 @export_app.command("colmap")
 def export_colmap(
-    run: Run,
-    scene: Scene,
-    device: Annotated[str, Argument(help="Map device, e.g. ios.")],
-    out: Annotated[Path, Argument(help="New folder for the model.")],
+    run: Run, scene: Scene, device: MapDevice, out: Annotated[Path, Argument(help="New folder for the model.")],
     capture: Capture = None, names: Names = "own",
 ) -> None:  # fmt: skip
     """Write the triangulated map of a run as a COLMAP model."""
@@ -676,12 +666,10 @@ def export_geo(
 
 @exporter("exif", "pictures")
 def export_exif(
-    run: Run,
-    out: Annotated[Path, Argument(help="Folder for copies of the pictures.")],
-    capture: Capture = None,
+    run: Run, out: Annotated[Path, Argument(help="Folder for copies of the pictures.")], capture: Capture = None,
     unsure: Annotated[bool, Option("--unsure", help="Also poses of low confidence.")] = False,
     xmp: Annotated[bool, Option("--xmp", help="XMP files to lie beside the pictures, instead of copies.")] = False,
-) -> None:
+) -> None:  # fmt: skip
     """Write position and direction into copies of the query pictures of a run in maps with GPS."""
 
 

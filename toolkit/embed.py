@@ -263,10 +263,8 @@ class _Model:
         capture = self.capture
         images = [(session, int(row)) for session in capture.usable("map") for row in session.camera_rows]
         if not images:
-            raise ToolkitError(
-                f"{capture.path}/sessions has no <device>_map session that can be read; `vlad` learns its vocabulary "
-                "from the map."
-            )
+            fault = "has no <device>_map session that can be read; `vlad` learns its vocabulary from the map"
+            raise ToolkitError(f"{capture.path}/sessions {fault}.")
         chosen: dict[str, list[int]] = {}
         for index in np.linspace(0, len(images) - 1, min(len(images), VOCABULARY_IMAGES)).astype(int).tolist():
             session, row = images[index]

@@ -40,10 +40,7 @@ NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 
 @contextmanager
 def write_atomic(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`, which is moved to `path` if the block ends without an error.
-
-    If the writer fails or is killed, the old file, if any, remains under the final name.
-    """
+    """Yield a temporary path beside `path`, which is moved to `path` if the block ends without an error."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     # The name contains process and machine, so that `sweep_partials` recognizes abandoned files.
@@ -122,19 +119,17 @@ def try_lock(path: Path) -> "tuple[BaseFileLock, bool]":
 
     lock: BaseFileLock = FileLock(path)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of filelock, that it takes a SoftFileLock for ENOSYS
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of filelock, that it takes a SoftFileLock for ENOSYS
+                lock.acquire(timeout=0)
+        except (OSError, NotImplementedError) as error:  # NotImplementedError: ENOSYS in earlier versions of filelock
+            if isinstance(error, OSError) and error.errno not in NO_LOCKS:  # such as Timeout
+                raise
+            lock = SoftFileLock(path.with_name(f"{path.name}.mark"))
             lock.acquire(timeout=0)
     except Timeout:
         return lock, False
-    except (OSError, NotImplementedError) as error:  # NotImplementedError: ENOSYS in earlier versions of filelock
-        if isinstance(error, OSError) and error.errno not in NO_LOCKS:
-            raise
-        lock = SoftFileLock(path.with_name(f"{path.name}.mark"))
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            return lock, False
     return lock, True
 
 
@@ -182,10 +177,7 @@ def environment_variable(name: str, value: str) -> Iterator[None]:
 
 
 def link_or_copy(source: str | Path, target: str | Path) -> None:
-    """Make `target` a hard link to a file of a run, or a copy if the disk does not support links.
-
-    Either way, no change of one shows in the other: the toolkit never changes a file, but replaces it as a whole.
-    """
+    """Make `target` a hard link to a file of a run, or a copy: the toolkit never changes a file, but replaces it."""
     try:
         os.link(source, target)
     except OSError:  # another disk, or one without hard links
@@ -193,8 +185,7 @@ def link_or_copy(source: str | Path, target: str | Path) -> None:
 
 
 def relative_url(path: Path) -> str:
-    """Return a file as the address of a link: relative to the notebook, as JupyterLab opens only what is below its own
-    folder, and a run folder can be moved."""
+    """Return the address of a link relative to the notebook, as JupyterLab opens only what is below its own folder."""
     return quote(os.path.relpath(path, Path.cwd()))
 
 
@@ -263,9 +254,7 @@ def write_sidecar(
     captured: Iterable[str | Path] = (),
     unfinished: bool = False,
 ) -> None:
-    """Record the settings and inputs of the artifact `path`, and the checksums of its files.
-
-    Call this after the artifact is written; an artifact without a matching record is made again.
+    """Record the settings and inputs of a written artifact, and the checksums of its files.
 
     Args:
         others: further files beside it that belong to the artifact.
@@ -290,10 +279,7 @@ def write_sidecar(
 
 
 def read_sidecar(path: str | Path) -> dict[str, Any] | None:
-    """Return the settings of the artifact `path`; None unless it is complete, undamaged and from this version.
-
-    A warning names what is damaged or missing.
-    """
+    """Return an artifact's settings; None, with a warning, unless it is complete, undamaged and from this version."""
     record = _read_record(path)
     if record.get("version") != __version__ or record.get("unfinished") or not record.get("files"):
         return None
@@ -323,9 +309,9 @@ def require_whole(path: str | Path, of: str | Path | None = None) -> None:
 def changed_sources(artifact: str | Path) -> list[Path]:
     """Return the files that an artifact was made from and that have changed since, or are missing.
 
-    Whatever reads several artifacts of a run asks this: if one of them is older than another that it was made from, the
-    two do not belong together. An artifact without a record is from another tool, and as current as can be known. A
-    file of the capture that is missing has not changed: results are read where their capture is not.
+    Artifacts of which one is older than another that it was made from do not belong together. One without a record is
+    from another tool, and as current as can be known. A file of the capture that is missing has not changed: results
+    are read where their capture is not.
     """
     # A file of the capture, which alone has an absolute path in the record, may be elsewhere.
     found = [(name, path, content, _content(path)) for name, path, content in _sources(artifact)]
@@ -378,9 +364,7 @@ def require_current(
 
 
 def older_files(folder: str | Path, stage: str) -> dict[str, str]:
-    """Return the sentence of `why_older`, by path, for all files below a stage's folder whose artifact is older than
-    what it was made from.
-    """
+    """Return the sentence of `why_older`, by path, for all files below a stage's folder that are older."""
     older: dict[str, str] = {}
     for record in sorted(Path(folder).rglob("*.meta.json")):
         artifact = record.with_name(record.name.removesuffix(".meta.json"))
@@ -398,8 +382,7 @@ _TIMES = {"seconds", "first_seconds"}
 
 def _content(path: str | Path) -> str | None:
     """Return a hash of a file, which is quick for an artifact with a record; None if it is missing. The time that
-    queries took does not count: the same poses, computed again, are the same. The folder `raw_data` of a session stands
-    for its images.
+    queries took does not count. The folder `raw_data` of a session stands for its images.
     """
     try:
         if Path(path).name == RAW_DATA:
@@ -491,8 +474,7 @@ def shipped(folder: str) -> Path:
 
 
 def project_root() -> Path:
-    """Return the folder with `data/` and `runs/`: the nearest one from here up with manifests; else the clone, or where
-    there is none, this folder."""
+    """Return the folder with `data/` and `runs/`: the nearest from here up with manifests; else the clone, or here."""
     here = Path.cwd()
     otherwise = here if (_PACKAGE / "notebooks").is_dir() else _PACKAGE.parent
     return next((folder for folder in (here, *here.parents) if (folder / "data_manifests").is_dir()), otherwise)
@@ -508,10 +490,8 @@ RUN_FILES = (
 class SceneFiles:
     """Paths of the files of one scene in a run folder."""
 
-    run: Path
-    """Run folder, `<output_root>/<manifest name>`."""
-    scene: str
-    """Name of the capture folder."""
+    run: Path  # `<output_root>/<manifest name>`
+    scene: str  # name of the capture folder
 
     def __post_init__(self) -> None:
         self.root = Path(self.run) / self.scene
@@ -527,15 +507,10 @@ class SceneFiles:
 
     def of_stage(self, stage: str) -> Path | None:
         """Return the folder of a stage's results; None if the stage writes only its executed notebook."""
-        return {
-            "embed": self.embeddings,
-            "retrieve": self.retrieval_dir,
-            "rerank": self.reranked_dir,
-            "localize": self.poses_dir,
-            "sequence": self.poses_dir,
-            "evaluate": self.evaluation,
-            "visualize": self.visualization,
-        }.get(stage)
+        of = {"embed": self.embeddings, "retrieve": self.retrieval_dir, "rerank": self.reranked_dir}
+        of |= {"localize": self.poses_dir, "sequence": self.poses_dir}
+        of |= {"evaluate": self.evaluation, "visualize": self.visualization}
+        return of.get(stage)
 
     @property
     def caches(self) -> tuple[Path, ...]:
@@ -543,9 +518,7 @@ class SceneFiles:
         return self.features, self.maps, self.index
 
     def folders(self, stage: str, reranked: bool = False) -> dict[str, Path]:
-        """Return the folders through which stages exchange results, by the names of the notebooks' parameters, for
-        references that are reranked or not.
-        """
+        """Return the folders through which stages exchange results, by the names of the notebooks' parameters."""
         out = self.of_stage(stage)
         return {
             "map_feats_root": self.embeddings,
@@ -585,8 +558,8 @@ def image_name(path: str) -> str:
 
 
 def own_name(name: str) -> str:
-    """Return the user's name of an image: for an imported image, its path in the folder it was imported from; unchanged
-    for others. `name` is relative to `raw_data`, or an `image_name`.
+    """Return the user's name of an image, its path in the folder it was imported from; unchanged for others. `name` is
+    relative to `raw_data`, or an `image_name`.
     """
     return re.sub(f"^([^/]+/raw_data/)?{IMPORTED}", "", name)
 
@@ -597,9 +570,7 @@ def pair_name(scene: str, map_device: str, query_device: str) -> str:
 
 
 def pair_devices(stem: str) -> tuple[str, str]:
-    """Return map and query device of a file with the `pair_name` of a pair, or that and `_sequence`, as its `stem`; two
-    empty ones of another file.
-    """
+    """Return map and query device of a file by its `stem`, `pair_name` or that and `_sequence`; else two empty ones."""
     devices = re.fullmatch(r".*_map_(.+?)_query_(.+?)(?:_sequence)?", stem)
     return (devices[1], devices[2]) if devices else ("", "")
 
@@ -634,11 +605,9 @@ def read_references(path: str | Path, *needed: str) -> list[dict[str, Any]]:
     """Return the rows of a file of references, one per query image.
 
     A row has at least `timestamp` (an integer), `sensor_id`, and `topk`, a list of map images, each with a `path`, and
-    the `needed` keys. Rows written by the toolkit have all keys described in the retrieve stage. Raise ArtifactError if
-    the file is missing or damaged, or a line is not such a row.
+    the `needed` keys. Raise ArtifactError if the file is missing or damaged, or a line is not such a row.
     """
-    rows: list[dict[str, Any]] = []
-    number = 0
+    rows, number = list[dict[str, Any]](), 0
     try:
         with open(path, encoding="utf-8") as lines:
             for line in lines:
@@ -668,9 +637,8 @@ def _checked(row: Any, keys: set[str]) -> dict[str, Any]:
 class Remade:
     """Base of objects that are pickled as their constructor arguments and made again where they are unpickled.
 
-    For networks and other objects that are expensive to make and that each worker needs once. A process keeps the last
-    object of each class. If `settings` is a dict, the new object must have the same settings: for example, `auto` may
-    select another precision on another machine.
+    A process keeps the last object of each class. If `settings` is a dict, the new object must have the same ones:
+    `auto` may select another precision on another machine.
     """
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
@@ -706,7 +674,6 @@ def _remade(kind: type, made_with: bytes, expected: dict[str, Any] | None = None
 def require_same(expected: Mapping[str, Any], here: Mapping[str, Any]) -> None:
     """Refuse, by a ToolkitError, to compute with settings that differ from those in the record of the results."""
     differing = [name for name in {**expected, **here} if expected.get(name) != here.get(name)]
-    found = "; ".join(f"{name}: {here.get(name)} here, {expected.get(name)} there" for name in differing)
-    if found:
+    if found := "; ".join(f"{name}: {here.get(name)} here, {expected.get(name)} there" for name in differing):
         do = "Set them in the manifest, or use machines of one kind."
         raise ToolkitError.at(f"worker on {platform.node()}", found, "the settings of the main process", do)

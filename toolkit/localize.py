@@ -162,9 +162,7 @@ def build_maps(
     sessions_root: str | Path, retrieval_dir: str | Path, out_dir: str | Path, features_dir: str | Path,
     map_dir: str | Path, settings: LocalizeSettings, devices: Sequence[str],
 ) -> list[Map]:  # fmt: skip
-    """Build the maps of `devices` without queries, so that `Map.open` can open them; the rest is as for
-    `localize_pairs`.
-    """
+    """Build the maps of `devices` without queries, for `Map.open`; the rest is as for `localize_pairs`."""
     folders = _Folders(*map(Path, (sessions_root, retrieval_dir, out_dir, features_dir, map_dir)))
     stage, maps = _Stage(folders, resolve_auto(settings), "all", skip_existing=True), list[Map]()
     with fixed_sums:
@@ -561,8 +559,14 @@ def _write_poses(path: Path, rows: Sequence[dict[str, Any]], settings: LocalizeS
 
 
 def explain_query(
-    sessions_root: str | Path, retrieval_dir: str | Path, features_dir: str | Path, map_dir: str | Path,
-    map_device: str, query_device: str, settings: LocalizeSettings, queries: str = "keyframes_pruned_subsampled",
+    sessions_root: str | Path,
+    retrieval_dir: str | Path,
+    features_dir: str | Path,
+    map_dir: str | Path,
+    map_device: str,
+    query_device: str,
+    settings: LocalizeSettings,
+    queries: str = "keyframes_pruned_subsampled",
     index: int = 0,
 ) -> tuple[FeedForwardLocalizer, Query, FeedForwardAnswer]:
     """Run the predictor on one query of a pair again, by its index in the keyframe list, with what `localize_pairs` was

@@ -72,15 +72,10 @@ Say = Callable[..., None]
 COUNTS_MIME = "application/vnd.visual-localization.counts+json"
 # The stages whose results each stage reads, besides the capture. If one of them runs again, so does the stage.
 UPSTREAM: dict[str, tuple[str, ...]] = {
-    "explore": (),
-    "embed": (),
-    "retrieve": ("embed",),
-    "rerank": ("retrieve",),
-    "localize": ("retrieve", "rerank"),
-    "sequence": ("localize",),
-    "evaluate": ("retrieve", "rerank", "localize", "sequence"),
+    "explore": (), "embed": (), "retrieve": ("embed",), "rerank": ("retrieve",), "localize": ("retrieve", "rerank"),
+    "sequence": ("localize",), "evaluate": ("retrieve", "rerank", "localize", "sequence"),
     "visualize": ("retrieve", "localize", "sequence"),
-}
+}  # fmt: skip
 
 _FILLED = {"rerank": ("features_dir",), "localize": ("features_dir", "map_dir")}
 """Parameters of notebooks that name a cache which their stage adds to."""
@@ -152,9 +147,7 @@ class Folders(SimpleNamespace):
 
     @property
     def values(self) -> "pd.DataFrame":
-        """The parameters, and other settings that are not at their defaults: the `value` that holds, and what it is
-        `from`, the notebook, the run or the default.
-        """
+        """Parameters, and settings not at their defaults: the `value`, `from` the notebook, the run or the default."""
         import pandas as pd
 
         default, of_run = Manifest.defaults(self._stage).flat(), self._manifest.stage(self._stage).flat()
@@ -312,7 +305,7 @@ def sessions_of(run: str | None, sessions_root: str | None) -> tuple[Path, Path 
 
 
 def own_folder(folder: str | None, scene: str, images: str | None = None) -> Path:
-    """Return the folder for a capture made of the user's own images, and for its results: as given; or by default
+    """Return the folder for a capture of the user's own images, and for its results: as given, else
     `<images>-localized` beside the folder `images`, or without images `data/<scene>` of the repository.
     """
     if folder is not None:
@@ -328,9 +321,8 @@ def own_folder(folder: str | None, scene: str, images: str | None = None) -> Pat
 def readable(table: "pd.DataFrame") -> "pd.DataFrame":
     """Return a stage's table as texts that fit a page: rows `<query> in <map>`, medians and recall first, no folders.
 
-    Columns without information are dropped: a `reason` that is always empty, a `state` that is always `evaluated`, and
-    `localized`, the sum of `ok` and `low_confidence`. Errors of positions in meters are shown in cm, recall in %. Names
-    of columns are shortened where the unit implies the quantity.
+    Columns without information are dropped. Errors of positions in meters are shown in cm, recall in %. Names of
+    columns are shortened where the unit implies the quantity.
     """
     from toolkit.results.metrics import small_unit, threshold_text
 
@@ -367,10 +359,8 @@ def _texts(column: "pd.Series[float]") -> "pd.Series[str]":
 def linked(table: "pd.DataFrame", sessions_root: Path | None = None) -> "Styler":
     """Return a table of queries whose column `image` links to the image files, as a notebook shows it.
 
-    Args:
-        table: queries by index or column `pair`, `<query device> in <map device>`; `image`, the user's names of its
-            images (`files.own_name`), joined by `;`.
-        sessions_root: `<capture>/sessions`; None: the column `sessions_root`, a folder or None for each query.
+    It has an index or a column `pair`, `<query device> in <map device>`, and the user's names of images joined by `;`.
+    `sessions_root` is `<capture>/sessions`; None: the column `sessions_root`, a folder or None for each query.
     """
     from toolkit.figures.query_images import MAX_LETTERS, shown_name
     from toolkit.pose.base import short_status
@@ -479,10 +469,7 @@ def notebook_path(stage: str) -> Path:
 
 
 def copy_notebooks(folder: Path) -> list[str]:
-    """Copy the notebooks into a folder for a person to change; return a sentence per notebook that is newer there.
-
-    A newer notebook replaces a copy only if the person has not changed it.
-    """
+    """Copy the notebooks into a folder for a person to change; return a sentence per newer one of a changed copy."""
     before = folder / ".from"
     before.mkdir(parents=True, exist_ok=True)
     kept = []
@@ -522,8 +509,8 @@ def check_parameters(path: Path, parameters: Iterable[str]) -> None:
 
 
 def _take_from_run(stage: str, files: SceneFiles, run: Path | None) -> None:
-    """Fill the folder of notebooks by hand, as far as no notebook has made results there, with hard links to those of a
-    finished run: new ones if that changes. Caches are taken once, as stages find in them what still fits.
+    """Link the results of a finished run, new ones if that changes, where no notebook by hand has made its own. Caches
+    are taken once, as stages find in them what still fits.
     """
     record, made_here = files.root / ".taken.json", files.of_stage(stage)
     taken = read_json(record)
@@ -773,7 +760,6 @@ class StatusLine:
         log.info("%s ...", head)
 
     def write(self, text: str) -> None:
-        """Show the last line of what the kernel writes to stderr."""
         lines = [line for line in re.split(r"[\r\n]", text) if line.strip()]
         if self.live and lines:
             width = shutil.get_terminal_size().columns - 1
@@ -799,13 +785,8 @@ def execute(
 ) -> tuple[Any, float]:  # fmt: skip
     """Execute the notebook `path` in a fresh kernel and write the executed copy to `output`.
 
-    Args:
-        output: path of the executed copy, which is also written if a cell fails.
-        progress: shows what the kernel writes to stderr.
-        kernels: source of the kernel; None: start one for this notebook.
-
-    Returns:
-        The executed notebook, and the peak memory (MB) of this process and its descendants, the kernel included.
+    `progress` shows what the kernel, of `kernels` or a new one, writes to stderr. Return the executed notebook, and the
+    peak memory (MB) of this process and its descendants, the kernel included.
 
     Raises:
         ManifestError: the notebook does not have one of the parameters.

@@ -186,10 +186,8 @@ class _Pair:
         """Return the rows of `session.images` of images in the retrieval file; raise if the session lacks one."""
         names = list(dict.fromkeys(_name(image) for image in images))
         if lacking := [name for name in names if name not in session.row_of_name]:
-            raise ArtifactError(
-                f"{self.retrieval}: {len(lacking)} images are not in {session.path / 'images.txt'}, first "
-                f"{lacking[0]}. The file belongs to another capture: retrieve again."
-            )
+            fault = f"{len(lacking)} images are not in {session.path / 'images.txt'}, first {lacking[0]}"
+            raise ArtifactError(f"{self.retrieval}: {fault}. The file belongs to another capture: retrieve again.")
         return np.array([session.row_of_name[name] for name in names], np.int64)
 
     def _reranked(

@@ -193,11 +193,9 @@ def _load(session: Session, embeddings: Path, normalize: bool) -> _Images:
     names = table["abs_path"].str.split(f"/sessions/{session.path.name}/raw_data/", n=1, regex=False).str[-1]
     rows = pd.Index(session.images["path"]).get_indexer(names)
     if (rows < 0).any():
-        raise ArtifactError(
-            f"{embeddings / session.id}: {(rows < 0).sum()} embedded images are not in "
-            f"{session.path / 'images.txt'}, first {table['abs_path'][int(np.argmax(rows < 0))]}. They belong to "
-            "another capture: embed again."
-        )
+        first = table["abs_path"][int(np.argmax(rows < 0))]
+        fault = f"{(rows < 0).sum()} embedded images are not in {session.path / 'images.txt'}, first {first}"
+        raise ArtifactError(f"{embeddings / session.id}: {fault}. They belong to another capture: embed again.")
     return _Images(session, rows, vectors, table)
 
 
@@ -234,10 +232,9 @@ def _load_queries(session: Session, embeddings: Path, queries: str, normalize: b
 def _require_same_dimension(query: _Images, database: _Images) -> None:
     if query.vectors.dims != database.vectors.dims:
         ours, theirs = (" + ".join(map(str, images.vectors.dims)) for images in (database, query))
-        raise ArtifactError(
-            f"map {database.session.id}, query {query.session.id}: the map's embeddings have {ours} "
-            f"dimensions, the query's {theirs}. Embed both again with the same model."
-        )
+        fault = f"the map's embeddings have {ours} dimensions, the query's {theirs}"
+        place = f"map {database.session.id}, query {query.session.id}"
+        raise ArtifactError(f"{place}: {fault}. Embed both again with the same model.")
 
 
 def _search(

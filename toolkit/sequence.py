@@ -247,10 +247,9 @@ class _Relocalizer:
     @cached_property
     def _map(self) -> Map:
         if SceneFiles(self._run, self._scene).poses_dir != self._expected:
-            raise ArtifactError(
-                f"{self._expected}: expected RUN/{self._scene}/poses, in a run folder whose map can be opened to "
-                "localize queries again. Write the poses there, or set relocalize: false."
-            )
+            expected = f"RUN/{self._scene}/poses, in a run folder whose map can be opened to localize queries again"
+            do = "Write the poses there, or set relocalize: false."
+            raise ArtifactError.at(self._expected, expected=expected, do=do)
         return Map.open(self._run, self._scene, self._device)
 
     def __call__(self, keys: pd.DataFrame, todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:

@@ -69,10 +69,8 @@ def rigid_poses(poses: ArrayLike, name: str) -> tuple[Floats, Bools]:
     if len(bad):
         mirrored = np.linalg.det(R[bad[0]]) < 0
         what = "is mirrored (determinant below 0)" if mirrored else "is not a rotation and a translation"
-        raise AlignmentError(
-            f"{name}[{bad[0]}] {what}: expected a rigid pose with a rotation orthonormal to 1e-3. "
-            "Remove a scale or a flip of axes first."
-        )
+        do = "Remove a scale or a flip of axes first."
+        raise AlignmentError(f"{name}[{bad[0]}] {what}: expected a rigid pose, orthonormal to 1e-3. {do}")
     matrices[:, :3, :3] = nearest_rotation(R)
     return matrices, finite
 

@@ -118,17 +118,13 @@ class DepthRatios:
             return cls(np.zeros(0), reference, [])
         if isinstance(ratios, list | tuple) and any(np.ndim(part) > 0 for part in ratios):
             if len(ratios) != count:
-                raise AlignmentError(
-                    f"depth_ratios has {len(ratios)} arrays: expected one array, or {count}, one per reference."
-                )
+                raise AlignmentError(f"depth_ratios has {len(ratios)} arrays: expected one, or {count} of references.")
             parts = [np.asarray(part, np.float64).ravel() for part in ratios]
             values, reference = np.concatenate(parts), np.repeat(np.arange(count), [len(part) for part in parts])
         else:
             values = np.asarray(ratios, np.float64)
             if values.ndim != 1:
-                raise AlignmentError(
-                    f"depth_ratios has shape {values.shape}: expected (R,), or a list of {count} arrays."
-                )
+                raise AlignmentError(f"depth_ratios has shape {values.shape}: expected (R,), or {count} arrays.")
             reference = np.full(len(values), -1)
         with np.errstate(invalid="ignore"):
             kept = np.isfinite(values) & (values > 0)
@@ -304,9 +300,8 @@ def align_to_map(
     model, model_finite = rigid_poses(model_from_cams, "model_from_cams")
     world, world_finite = rigid_poses(world_from_cams, "world_from_cams")
     if len(model) != len(world):
-        raise AlignmentError(
-            f"Found {len(model)} model_from_cams and {len(world)} world_from_cams: expected equal numbers."
-        )
+        found = f"{len(model)} model_from_cams and {len(world)} world_from_cams"
+        raise AlignmentError(f"Found {found}: expected equal numbers.")
     weight = checked_weights(weights, len(model))
     ratios = DepthRatios.of(depth_ratios, len(model))
     for name, value in (("center_noise_m", center_noise_m), ("rotation_noise_deg", rotation_noise_deg)):

@@ -204,9 +204,7 @@ def shrunk(image: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
 
 
 def read_for_display(path: str | Path, longest: int) -> NDArray[np.uint8]:
-    """Return an image, (H, W, 3) RGB, of at most `longest` pixels; for an unreadable file, one with the text
-    `unreadable`.
-    """
+    """Return an image, (H, W, 3) RGB, of at most `longest` pixels; for an unreadable file, one that says so."""
     try:
         return read_image(path, longest=longest)
     except ImageError:
@@ -509,9 +507,7 @@ def view_bounds(camera: pycolmap.Camera) -> Floats:
 
 
 def in_view(points_in_cams: Floats, bounds: Floats) -> NDArray[np.bool_]:
-    """Tell which points (J, P, 3) in the frames of J cameras lie in their fields of view, `view_bounds` (J, 4); bool
-    (J, P).
-    """
+    """Tell (J, P) which points (J, P, 3), in the frames of J cameras, lie in their views, `view_bounds` (J, 4)."""
     z = points_in_cams[..., 2]
     x, y = points_in_cams[..., 0] / np.maximum(z, 1e-6), points_in_cams[..., 1] / np.maximum(z, 1e-6)
     b = bounds[:, None]

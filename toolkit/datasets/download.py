@@ -7,12 +7,8 @@
     partial/         files being fetched and archives to be unpacked, named by a fingerprint of path and version
     unpacked/        an archive being unpacked
 
-`hf_hub_download` of huggingface_hub 2.4 and `retrieve` of pooch 1.9 fetch to a random name that no later process finds.
-`http_get`, which `hf_hub_download` is made of, appends to the file that it is given, resumes when a connection breaks,
-and waits as long as a busy server asks.
-
-In LaMAR (Sarlin, Dusmanu et al., ECCV 2022) one session `map` holds phones and headsets, and `queries.txt` lists the
-queries. Here each session has one device, and `proc/keyframes_*.txt` list the queries.
+`hf_hub_download` of huggingface_hub 2.4 and `retrieve` of pooch 1.9 fetch to a random name that no later process finds;
+`http_get` of huggingface_hub appends to the given file, resumes, and waits as long as a busy server asks.
 """
 
 import fnmatch
@@ -59,11 +55,8 @@ class FileError(DownloadError):
 def unpack(archive: Path, target: Path, target_path: Callable[[str], str | None], name: str) -> None:
     """Unpack a zip archive into a new folder: regular files only, nothing outside of it, no more than the disk holds.
 
-    `target_path` maps a member's path to its path below `target`, or to None to skip it; `name` is for messages.
-
-    Raises:
-        DownloadError: a member's path leaves the folder; a member is no regular file, is encrypted, or occurs twice;
-            the archive is damaged, or all is skipped; the disk is too small.
+    `target_path` maps a member's path to its path below `target`, or to None to skip it; `name` is for messages. Raise
+    DownloadError for any other member, a damaged archive or one without a requested session, and a disk too small.
     """
     from tqdm.auto import tqdm
 
@@ -101,10 +94,8 @@ def require_space(folder: Path, needed_bytes: int) -> None:
     """Raise DownloadError if `needed_bytes` do not fit on the disk of `folder`."""
     free, needed = shutil.disk_usage(folder).free, int(needed_bytes * _SPACE_FACTOR)
     if needed > free:
-        raise DownloadError(
-            f"{folder}: about {size_text(needed)} are needed on this disk and {size_text(free)} are free. Free some "
-            "space, set CAPTURES to a folder on another disk, or fetch fewer sessions (--sessions)."
-        )
+        do = "Free some, set CAPTURES to a folder on another disk, or fetch fewer sessions (--sessions)."
+        raise DownloadError(f"{folder}: about {size_text(needed)} are needed and {size_text(free)} are free. {do}")
 
 
 def size_text(count_bytes: int) -> str:
@@ -114,11 +105,9 @@ def size_text(count_bytes: int) -> str:
 def arrange(sessions: Path, names: Mapping[str, str]) -> list[str]:
     """Rename the sessions of a data set; split by device, in place, a session that several new names refer to.
 
-    The subsessions of a device have names that begin with `<device>_`. `names` has, for each new name `<device>_<map or
-    query>`, the session's name in the data set; others stay as they are. Return notes on what was left out.
-
-    Raises:
-        CaptureError: a session to split has no subsession of a device, or an invalid subsession name.
+    `names` maps `<device>_<map or query>` to a name in the data set. In LaMAR (Sarlin, Dusmanu et al., ECCV 2022) the
+    session `map` has subsessions `<device>_*` of several devices, and `queries.txt` lists the queries. Return notes on
+    what was left out. Raise CaptureError if a device has no subsession, or for an invalid subsession name.
     """
     notes = []
     for old in [sessions / name for name in dict.fromkeys(names.values())]:
@@ -136,7 +125,6 @@ def arrange(sessions: Path, names: Mapping[str, str]) -> list[str]:
 
 
 def _split(old: Path, new: list[Path]) -> list[str]:
-    """Split a session into one per device; return notes on what was left out."""
     list_file = old / "proc" / "subsessions.txt"
     lines = list_file.read_text(encoding="utf-8").splitlines() if list_file.is_file() else []
     subsessions = {line.strip() for line in lines if line.strip() and not line.startswith("#")}
@@ -146,8 +134,7 @@ def _split(old: Path, new: list[Path]) -> list[str]:
     unclaimed = set(subsessions)
     for session in new:
         device = session.name.rpartition("_")[0]
-        own = {name for name in subsessions if name.startswith(f"{device}_")}
-        unclaimed -= own
+        unclaimed -= (own := {name for name in subsessions if name.startswith(f"{device}_")})
         if not own:
             found = ", ".join(sorted(subsessions)[:3]) or "none"
             raise CaptureError(f"{old.name}: expected subsessions of {device!r}, named {device}_...; found {found}.")
@@ -176,18 +163,14 @@ _WORKERS = 8  # threads for small files, which mostly wait for the network; arch
 def download(
     manifest_path: str | Path, sessions: Sequence[str] = (), dry_run: bool = False, overrides: Iterable[str] = ()
 ) -> "list[CheckReport]":
-    """Download the captures of a manifest, or only some sessions, into their folders; check them; print what is done.
+    """Download the captures of a manifest, or only some sessions, into their folders; return their check reports.
 
     Files already there are not fetched again; on a dry run none is, only listed. `overrides` are `key=value` or
-    `section.key=value`, in place of the manifest's values. Return the check report of each capture.
-
-    Raises:
-        ManifestError: the manifest does not say where its captures are, or has no such session.
-        DownloadError, OSError: something cannot be fetched, unpacked or stored. The same command resumes the download.
+    `section.key=value`, in place of the manifest's values. Raise ManifestError if the manifest does not say where its
+    captures are, or has no such session; DownloadError or OSError if something cannot be fetched, unpacked or stored.
     """
     manifest = load_manifest(manifest_path, overrides)
-    dataset = manifest.dataset
-    if dataset is None:
+    if (dataset := manifest.dataset) is None:
         raise ManifestError(f"{manifest_path}: has no section `dataset`. See data_manifests/crocodl-hydro.yaml.")
     for name in sessions:
         if name not in dataset.session_names:
@@ -201,7 +184,7 @@ def download(
             print(f"{folder.name}: nothing is fetched. dataset.sources: {nearest(folder.name, dataset.sources)}")
     if not captures:
         raise ManifestError(f"{manifest_path}: dataset.sources has no entry for any folder in `captures`.")
-    needed_bytes: Counter[Path] = Counter()
+    needed_bytes = Counter[Path]()
     for capture in captures:
         capture.list_files()
         capture.describe(dry_run)
@@ -249,10 +232,7 @@ class RemoteFile:
             return kind not in digests or hashlib.file_digest(stream, digests[kind]).hexdigest() == expected
 
     def fetch(self, partial: Path, headers: Mapping[str, str], bar: Any) -> None:
-        """Fetch the missing bytes to `partial`, which may hold the first ones already, and advance a tqdm bar.
-
-        An error of the disk, of huggingface_hub, or of its HTTP client is raised; `partial` stays.
-        """
+        """Append the missing bytes to `partial`, which stays if an error is raised, and advance a tqdm bar."""
         from huggingface_hub.file_download import http_get
 
         failures, before = 0, _size(partial) or 0
@@ -277,7 +257,7 @@ class RemoteFile:
 
 @dataclass
 class _Capture:
-    """The download of one capture: the files of its source, the state on disk, and the steps."""
+    """The download of one capture."""
 
     folder: Path
     dataset: DatasetSettings
@@ -288,17 +268,15 @@ class _Capture:
         self.state, hub = self.folder / STATE, self.source.hub
         self.origin = f"dataset {hub} ({self.source.revision})" if hub else ", ".join(self.source.urls)
         self.page = f"https://huggingface.co/datasets/{hub}" if hub else self.dataset.page
-        self.files: list[RemoteFile] = []
+        self.files = list[RemoteFile]()
         self.bar: Any = None
-        self.done: set[tuple[str, str, str]] = set()
-        """Path, version and, for an archive, a session: it may be unpacked for one now and for another later."""
+        # Path, version and, for an archive, a session: it may be unpacked for one now and for another later.
+        self.done = set[tuple[str, str, str]]()
         if (record := self.state / "done.jsonl").is_file():
             for line in record.read_text(encoding="utf-8").splitlines():
                 with suppress(ValueError):  # a kill cut this line off: its file counts as not done
                     row = json.loads(line)
                     self.done |= {(row["path"], row["version"], name) for name in row.get("sessions") or [""]}
-
-    # List the files of the source
 
     def list_files(self) -> None:
         """List the files of the requested sessions."""
@@ -344,14 +322,11 @@ class _Capture:
         """Return the error about a failed request to the hub or a URL; a FileError if the server has no such file."""
         kind = FileError if status_of(error) in (404, 416) else DownloadError
         reason = failure_reason(error, self.page, ", ".join(self.source.urls))
-        return kind(
-            f"{what}: {reason}.\nCheck the network, HTTPS_PROXY, HF_ENDPOINT, HF_HUB_OFFLINE, access to {self.page} "
-            f"(for the hub: `hf auth login`), and `dataset.sources.{self.folder.name}` by {self.dataset.page}. Then "
-            "run the same command: it resumes the download."
-        )
+        check = f"Check the network, HTTPS_PROXY, HF_ENDPOINT, HF_HUB_OFFLINE, access to {self.page} (`hf auth login`)"
+        where = f"`dataset.sources.{self.folder.name}` by {self.dataset.page}"
+        return kind(f"{what}: {reason}.\n{check}, and {where}. Then run the same command: it resumes the download.")
 
     def _wants(self, path: str) -> bool:
-        """Return whether to download the file with this path in the capture."""
         included = any(fnmatch.fnmatchcase(path, pattern) for pattern in self.dataset.include)
         return included or any(_is_of(path, session) for session in self.names.values())
 
@@ -362,8 +337,6 @@ class _Capture:
         print(f"  license  {data.license}\n  cite     {data.citation or '-'}\n  about    {data.page}")
         for file in self.files if in_full else ():
             print(f"    {size_text(file.size):>9}  {file.path}")
-
-    # What is on disk
 
     def _sessions_in(self, file: RemoteFile) -> list[str]:
         """Return the requested sessions that an archive may hold, by their names in the capture; "" for other files."""
@@ -378,10 +351,10 @@ class _Capture:
     def _is_done(self, file: RemoteFile) -> bool:
         """Return whether this version of a file, or what an archive was unpacked to, is in place already."""
         sessions = self._sessions_in(file)
-        in_place = all((self.folder / "sessions" / name).is_dir() for name in sessions)
-        if not file.is_archive:
-            in_place = _size(self.folder / file.path) == file.size
-        return in_place and {(file.path, file.version, name) for name in sessions} <= self.done
+        if not file.is_archive and _size(self.folder / file.path) != file.size:
+            return False
+        recorded = {(file.path, file.version, name) for name in sessions} <= self.done
+        return recorded and all((self.folder / "sessions" / name).is_dir() for name in sessions)
 
     def needed_bytes(self, unpacked: bool = True) -> int:
         """Return how many bytes are to be fetched; `unpacked`: and how many more the content of archives takes."""
@@ -391,8 +364,6 @@ class _Capture:
         packed = max((file.size for file in files if file.is_archive and unpacked), default=0)
         return sum(max(0, file.size - size) for file, size in zip(files, have, strict=True)) + packed
 
-    # Fetch the files
-
     def run(self) -> "CheckReport":
         """Fetch, unpack and arrange all files of the capture; check it."""
         from toolkit.capture.check import check_capture
@@ -400,8 +371,8 @@ class _Capture:
         self.state.mkdir(parents=True, exist_ok=True)
         lock, acquired = try_lock(self.state / "lock")
         if not acquired:
-            do = f"Wait for it; if there is none, delete {lock.lock_file}."
-            raise DownloadError(f"{self.folder}: another download into this folder is running. {do}")
+            fault = f"{self.folder}: another download into this folder is running"
+            raise DownloadError(f"{fault}. Wait for it; if there is none, delete {lock.lock_file}.")
         try:
             self._fetch_all()
         finally:
@@ -422,10 +393,8 @@ class _Capture:
         files = [file for file in self.files if not self._is_done(file)]
         total = sum(file.size for file in self.files)
         have = total - self.needed_bytes(unpacked=False)
-        with (
-            tqdm(total=total, initial=have, desc=self.folder.name, unit="B", unit_scale=True) as self.bar,
-            ThreadPoolExecutor(_WORKERS) as pool,
-        ):
+        self.bar = tqdm(total=total, initial=have, desc=self.folder.name, unit="B", unit_scale=True)
+        with self.bar, ThreadPoolExecutor(_WORKERS) as pool:
             errors = [*pool.map(self._obtain, [file for file in files if not file.is_archive])]
             errors += map(self._obtain, [file for file in files if file.is_archive])
         if failures := [str(error) for error in errors if error]:
@@ -469,8 +438,8 @@ class _Capture:
             raise self._failure(what, error) from error
         if not file.matches(partial):
             partial.unlink()
-            again = f"The data were deleted. Run the command again, or put a right file of {file.url} at {target}."
-            raise FileError(f"{file.path}: wrong checksum, expected {file.version}. {again}")
+            do = f"It was deleted. Run the command again, or put a right file of {file.url} at {target}."
+            raise FileError(f"{file.path}: wrong checksum, expected {file.version}. {do}")
         partial.replace(target)
 
     def _unpack(self, file: RemoteFile, archive: Path) -> None:

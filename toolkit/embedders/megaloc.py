@@ -67,9 +67,7 @@ class MegaLocEmbedder(Remade):
         return {"name": self.name, "weights": self._weights, **sizes, "dtype_compute": precision}
 
     def prepare(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Resize an image (H, W, 3) or (H, W), uint8 RGB or gray, to the network's input (S, S, 3), else raise
-        ValueError.
-        """
+        """Resize an image (H, W, 3) or (H, W), uint8 RGB or gray, to (S, S, 3); raise ValueError if it is none."""
         image = np.asarray(image)
         if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)) or not image.size:
             raise ValueError(f"an image is {image.dtype} {image.shape}; expected uint8 (H, W, 3) RGB or (H, W).")

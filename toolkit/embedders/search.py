@@ -169,9 +169,7 @@ def blocks(vectors: NDArray[Any] | Vectors, size: int) -> Iterator[tuple[int, ND
 
 
 def require_finite(matrix: NDArray[np.float32], name: str, first: int | Ints = 0) -> None:
-    """Raise ValueError if a value of the matrix `name` is not finite; `first` is the number of its first row, or of
-    all.
-    """
+    """Raise ValueError if a value of the matrix `name` is not finite; `first`: number of its first row, or of all."""
     bad = ~np.isfinite(matrix).all(axis=1)
     if bad.any():
         index = int(bad.argmax())

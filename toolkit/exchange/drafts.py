@@ -102,43 +102,24 @@ _MAX_FOR_UP = 300  # cameras that tell what is up
 class Options:
     """What all imports take, besides their own input."""
 
-    placing: str = "link"
-    """`link` to the images, or `copy` them."""
-    axes: str = "opencv"
-    """Camera axes of the poses, see `AXES`."""
-    unit_m: float | None = None
-    """Meters per unit of the poses; None: unknown, as after structure from motion. The poses are then not scaled, and
-    the session records that their unit is unknown."""
-    hold_out: int = 0
-    """Every `hold_out`-th frame of a map, in order of names, becomes a query with ground truth instead; 0: none."""
-    match_names: bool = False
-    """Take files whose names differ only in case, extension or separators."""
-    masks: str | Path | None = None
-    """Folder of masks, see `images.find_mask`; they are placed as the images are."""
-    gps: bool = False
-    """Move the world to x east, y north, z up, in meters, by the GPS of at least three images: of `fixes`, or EXIF."""
-    positions: str | Path | None = None
-    """The same by a CSV file with the columns image, x, y, z: camera centers, meters."""
-    timestamps: str | Path | None = None
-    """When images were taken: a file of times and names, or `names`; see `recordings.read_times`. None: from EXIF."""
-    timestamps_unit: str | None = None
-    """Of these: `s`, `ms`, `us` or `ns`; None: told by times since 1970."""
-    odometry: str | Path | None = None
-    """The device's own poses, for the queries: a list as of `recordings.read_track`, with `axes` and `unit_m`."""
-    depth: str | Path | None = None
-    """Folder of depth maps, see `recordings.find_depths`: PNG, 16 bits, 0 and 65535 where unknown."""
-    depth_unit_mm: float = 1.0
-    """Millimeters per unit of these; TUM: 0.2."""
-    depth_camera: str | None = None
-    """Intrinsics of the depth maps, `MODEL, width, height, parameter, ...`, if they are not those of the images."""
-    fixes: str | Path | None = None
-    """GPS fixes, which can limit the search: a table as of `recordings.read_fixes`, or `exif`."""
-    replace: bool = False
-    """Replace a session that exists, at once."""
-    add: bool = False
-    """Add the images that a session lacks; what it has stays as it is."""
-    record: dict[str, Any] = field(default_factory=dict)
-    """Further content of `proc/import.json`."""
+    placing: str = "link"  # to the images, or `copy` them
+    axes: str = "opencv"  # camera axes of the poses, see `AXES`
+    unit_m: float | None = None  # meters per unit of the poses; None: unknown and recorded as such, not scaled
+    hold_out: int = 0  # every `hold_out`-th frame of a map, in order of names, becomes a query with truth; 0: none
+    match_names: bool = False  # take files whose names differ only in case, extension or separators
+    masks: str | Path | None = None  # folder of masks, see `images.find_mask`; they are placed as the images are
+    gps: bool = False  # move the world to x east, y north, z up, in meters, by GPS of three images: of `fixes`, or EXIF
+    positions: str | Path | None = None  # the same by a CSV file, columns image, x, y, z: camera centers, meters
+    timestamps: str | Path | None = None  # file of times and names, or `names`: `recordings.read_times`; None: EXIF
+    timestamps_unit: str | None = None  # of these: `s`, `ms`, `us` or `ns`; None: told by times since 1970
+    odometry: str | Path | None = None  # of queries: a list as of `recordings.read_track`, with `axes` and `unit_m`
+    depth: str | Path | None = None  # folder, see `recordings.find_depths`: PNG, 16 bits, 0 and 65535 where unknown
+    depth_unit_mm: float = 1.0  # millimeters per unit of these; TUM: 0.2
+    depth_camera: str | None = None  # their intrinsics, `MODEL, width, height, ...`, if not those of the images
+    fixes: str | Path | None = None  # GPS, which can limit the search: a table as of `recordings.read_fixes`, or `exif`
+    replace: bool = False  # a session that exists, at once
+    add: bool = False  # the images that a session lacks; what it has stays as it is
+    record: dict[str, Any] = field(default_factory=dict)  # further content of `proc/import.json`
 
 
 @dataclass
@@ -201,8 +182,7 @@ class Draft(Options):
         self, name: str, camera: pycolmap.Camera | str, world_from_cam: Floats | str | None, origin: str,
         time_us: int | None = None,
     ) -> None:  # fmt: skip
-        """Add an image that is not in a rig, with the `origin` of its intrinsics. Images with equal intrinsics share a
-        camera.
+        """Add an image without a rig; those with equal intrinsics, from `origin`, share a camera.
 
         Camera or pose may be why there is none, and the image is left out. Without `time_us`, its time is from EXIF.
         """
@@ -215,11 +195,10 @@ class Draft(Options):
             self.poses[name] = world_from_cam
 
     def finish(self, held: Collection[str] | None = None) -> ImportReport:
-        """Write the session without the images that cannot be used, and the queries that are held out of it.
+        """Write the session, and the queries held out of it: the frames `held`; None: every `hold_out`-th.
 
-        These are the frames `held`, or images without rigs; None: every `hold_out`-th. Raise CaptureError if a session
-        has no image left, or exists; none is written; ManifestError if `hold_out` is not 0 or between 2 and the number
-        of frames.
+        Raise CaptureError if a session has no usable image, or exists, and ManifestError if `hold_out` is larger than
+        the number of frames; none is then written.
         """
         self._take_times()
         self._place_world()
@@ -244,7 +223,7 @@ class Draft(Options):
         return report
 
     def _others_than(self, listed: Collection[str]) -> list[str]:
-        """Return the images that are in the folder, and not listed: with `beside`, only in folders of listed ones."""
+        """Return the images in the folder that are not listed: with `beside`, only in folders of listed ones."""
         names = list[str]()
         if self.beside:
             folders = {PurePosixPath(name).parent for name in listed}
@@ -381,13 +360,10 @@ class Draft(Options):
         self.rigs = [(f"{rig}{suffix}", f"{sensor}{suffix}", pose) for rig, sensor, pose in self.rigs]
 
     def source(self, name: str) -> Path:
-        """Return the file of an image."""
         return self.sources.get(name, self.folder / name)
 
     def _find_masks(self) -> dict[str, Path]:
-        """Return the masks of the images by name, and note those that do not fit; raise CaptureError if a given folder
-        has none.
-        """
+        """Return masks by image, and note those that do not fit; raise CaptureError if a given folder has none."""
         folder = None if self.masks is None else Path(self.masks)
         found = {image.name: self.mask_files.get(image.name) or find_mask(self.source(image.name), folder)
                  for image in self.images}  # fmt: skip
@@ -478,7 +454,6 @@ class Draft(Options):
         return times, self._find_masks(), self._odometry(times), self._fix_rows(times), self._find_depths(times)
 
     def write(self) -> ImportReport:
-        """Write the session; call `leave_out` before."""
         if turned := sum(image.turned for image in self.images):
             self.notes.append(f"{turned} images have an EXIF orientation, which is ignored: pixels are used as stored")
         times, masks, odometry, fixes, depths = self.prepared
@@ -731,9 +706,7 @@ def _append(made: Path, session: Path) -> None:
 
 
 def every_nth(frames: Sequence[str], number: int) -> set[str]:
-    """Return every `number`-th of the frames, which becomes a query; none if it is 0. Raise ManifestError if there are
-    fewer.
-    """
+    """Return every `number`-th of the frames; none if it is 0. Raise ManifestError if there are fewer."""
     if number > len(frames):
         raise ManifestError(f"hold-out: found {number}, but there are {len(frames)} frames. Give a smaller number.")
     return set(frames[number - 1 :: number]) if number else set()
@@ -742,13 +715,12 @@ def every_nth(frames: Sequence[str], number: int) -> set[str]:
 def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES, draft: Draft | None = None) -> list[str]:
     """Return the images in and below a folder, sorted by path, see `walk_files`; raise CaptureError if there is none.
 
-    Masks are skipped (see `images.find_mask`), and names that are not Unicode. The draft gets the files that are left
-    out, by the reason.
+    Masks are skipped, and names that are not Unicode. The draft gets the files that are left out, by the reason.
     """
     files, captures = walk_files(folder)
     names = sorted((name for name in files if name.lower().endswith(suffixes) and not _is_mask(name)), key=Path)
     broken = [name for name in names if printable(name) != name]
-    names = [name for name in names if name not in set(broken)] if broken else names
+    names = [name for name in names if printable(name) == name]
     others = {"its name is not UTF-8: rename it": broken} if broken else {}
     for name in files:
         if (suffix := name[name.rfind(".") :].lower()) in KNOWN_SUFFIXES and suffix not in suffixes:

@@ -2,23 +2,18 @@
 local features and matches in the HDF5 files of hloc (https://github.com/cvg/Hierarchical-Localization), which are also
 imported; results on the Earth: tables for maps and GIS, and position and direction in the EXIF tags of the images.
 
-`names="own"` gives images the names that the user knows (`files.own_name`): an imported image has its path in the
-folder it was imported from, other images have their path relative to the capture's folder `sessions`. With
-`names="capture"` all paths are relative to `sessions`, as in files of local features and matches.
-
-The run records where its captures are; `capture` is the new folder of one that has moved. All exports raise
-ManifestError for an unknown choice of names, a capture that is in neither place, or a capture with another name.
+With `names="own"`, images have the names that the user knows (`files.own_name`), with `names="capture"` their paths
+relative to `sessions`, as in files of local features and matches. `capture` is the new folder of a capture that has
+moved since the run. All exports raise ManifestError for an unknown choice of names, a capture that is in neither place,
+or one with another name.
 
 A file of features of hloc has one group per image, with the image's name: `keypoints` (N, 2), `descriptors` (D, N) of
 unit length, `scores` (N,), `image_size` (2,) and, beyond hloc, `scales` (N,) of the keypoints. The center of the
-top-left pixel is at 0, and an attribute of the file says so; in `LocalFeatures` it is at 0.5.
+top-left pixel is at 0, and an attribute of the file says so; in `LocalFeatures` it is at 0.5. A file of matches has one
+group per pair of images, `<image>/<image>` with `/` in the names replaced by `-`: `matches0` (N,), for each feature of
+the first image the index of the matching feature of the second image or -1, and `matching_scores0` (N,).
 
-A file of matches has one group per pair of images, `<image>/<image>` with `/` in the names replaced by `-`: `matches0`
-(N,), for each feature of the first image the index of the matching feature of the second image or -1, and
-`matching_scores0` (N,).
-
-On the Earth are only maps with an origin, see `georeference.origin_of`. Altitudes are those of the GPS that placed the
-map.
+On the Earth are only maps with an origin, see `georeference.origin_of`; altitudes are of the GPS that placed the map.
 """
 
 import json
@@ -84,15 +79,10 @@ def export_colmap(
 ) -> pycolmap.Reconstruction:
     """Write the triangulated map that a run localized with as a binary COLMAP model.
 
-    All keypoints are written, including those without a point. Pixel coordinates are the same in COLMAP and here: the
-    center of the top-left pixel is (0.5, 0.5). If the run used several kinds of features, their keypoints and points
-    are concatenated. The rig frame is the frame of its first camera, as COLMAP requires; rigs with the same cameras at
-    the same poses are merged into one.
-
-    Raises:
-        ArtifactError: the run has not localized in such a map, the map was built again since, or it was built from
-            other images or features than those that are there.
-        ManifestError: the folder `out` contains files.
+    All keypoints are written, including those without a point; those of several kinds of features are concatenated. The
+    center of the top-left pixel is (0.5, 0.5), as here. The rig frame is that of its first camera, as COLMAP requires;
+    rigs with the same cameras at the same poses are merged. Raise ArtifactError if the run has not localized in such a
+    map, or that map was built again since, or from other images or features; ManifestError if `out` contains files.
     """
     require_known("names", names, NAMES)
     files, session_id, out = SceneFiles(Path(run), scene), f"{device}_map", Path(out)
@@ -119,8 +109,7 @@ def export_colmap(
 def _maps_of(files: SceneFiles, device: str) -> list[Path]:
     """Return the files of the triangulated maps that a run localized with, one per kind of features."""
     for path in sorted(files.poses_dir.glob(f"{pair_name(files.scene, device, '*')}.h5")):
-        maps = [files.maps / name for name in names_of_maps(path)]
-        if maps:
+        if maps := [files.maps / name for name in names_of_maps(path)]:
             require_current(path.with_suffix(".txt"), "localize", (".npz",))
             return maps
     raise ArtifactError(f"{files.poses_dir}: no query was localized in a triangulated map of {device}. {_LOCALIZE}")
@@ -141,8 +130,7 @@ def colmap_model(
 ) -> pycolmap.Reconstruction:
     """Return a map as a COLMAP model; the map's observations index the keypoints (n, 2) of each image."""
     row_of = session.row_of_name
-    missing = [name for name in local_map.image_names if name not in row_of]
-    if missing:
+    if missing := [name for name in local_map.image_names if name not in row_of]:
         raise ArtifactError(f"{session.path}: image {missing[0]} of the map is not in it. Run the map's stages again.")
     rows = np.array([row_of[name] for name in local_map.image_names], np.int64)
     sensors = session.images["sensor_id"].to_numpy(str)[rows]
@@ -182,7 +170,6 @@ def colmap_model(
 def _add_rig(
     model: pycolmap.Reconstruction, cameras: Sequence[pycolmap.Camera], first_from_cams: Floats
 ) -> tuple[int, list[int]]:
-    """Add a rig and its cameras to a model; return their ids."""
     rig, camera_ids = pycolmap.Rig(), list[int]()
     rig.rig_id = model.num_rigs() + 1
     for camera, first_from_cam in zip(cameras, first_from_cams, strict=True):
@@ -205,9 +192,8 @@ def _rigid(pose: Floats) -> pycolmap.Rigid3d:
 def export_table(session: Session, out: str | Path, ground_truth: bool = False) -> Path:
     """Write the cameras and poses of a session's images as the table that `interchange.import_images` reads.
 
-    Image names are relative to the session's `raw_data`, poses are world_from_cam. If some images have poses, the
-    others are left out. If none has, the table has cameras only. With `ground_truth`, poses are those of
-    `session.ground_truth`; otherwise, map sessions have those of `session.trajectory` and query sessions none.
+    Image names are relative to the session's `raw_data`, poses are world_from_cam: with `ground_truth` the true ones,
+    else those of a map. Images without a pose are left out, unless none has one: the table then has cameras only.
     """
     rows = session.camera_rows
     poses = session.world_from_cam(rows, ground_truth)
@@ -234,9 +220,8 @@ def export_pairs(
 ) -> int:  # fmt: skip
     """Write the retrieval of a pair in hloc's format, `query reference` per line, and return the number of lines.
 
-    Queries have `topk` references; None: all retrieved ones. Raise ArtifactError if the run has no such retrieval, it
-    is of older vectors, a line of it is malformed, a name contains a space, or a query and a reference have the same
-    name.
+    Queries have `topk` references; None: all. Raise ArtifactError if the run has no such retrieval, it is of older
+    vectors or malformed, a name contains a space, or a query and a reference have the same name.
     """
     require_known("names", names, NAMES)
     path = SceneFiles(Path(run), scene).retrieval(map_device, query_device)
@@ -244,8 +229,7 @@ def export_pairs(
     pairs = []
     for row in read_references(path, "path"):
         paths = [str(entry["path"]) for entry in (row, *row["topk"][:topk])]
-        invalid = [name for name in paths if "/sessions/" not in name]
-        if invalid:
+        if invalid := [name for name in paths if "/sessions/" not in name]:
             raise ArtifactError(f"{path}: expected images as SCENE/sessions/..., found {invalid[0]!r}. Retrieve again.")
         query, *references = (_listed(image_name(name), names, path) for name in paths)
         pairs += [(query, reference) for reference in references]
@@ -261,10 +245,10 @@ def export_poses(
 ) -> int:  # fmt: skip
     """Write the poses of a pair's queries in hloc's format, `name qw qx qy qz tx ty tz` for each image.
 
-    Poses are cam_from_world in the unit of the capture; a rig has one line per camera. Queries without a pose are left
-    out. Names are complete paths; `file`: file names only, as hloc and visuallocalization.net have them. Return the
-    number of lines. Raise ArtifactError if the run has no such poses, they are of older references or of an older map,
-    or a name contains a space.
+    Poses are cam_from_world in the unit of the capture; a rig has one line per camera, a query without a pose none.
+    Names are complete paths; `file`: file names only, as visuallocalization.net has them. Return the number of lines.
+    Raise ArtifactError if the run has no such poses, they are of older references or of an older map, or a name
+    contains a space.
     """
     require_known("names", names, NAMES)
     path = _require_poses(SceneFiles(Path(run), scene).poses_txt(map_device, query_device))
@@ -302,7 +286,6 @@ def _write_list(out: str | Path, rows: Iterable[tuple[str, ...]]) -> int:
 
 
 def _exported(name: str, names: str) -> str:
-    """Return the exported name of an image, given its name in the capture."""
     return own_name(name) if names == "own" else name if names == "capture" else name.rpartition("/")[2]
 
 
@@ -333,7 +316,7 @@ def session_of_run(run: str | Path, scene: str, session_id: str, capture: str | 
 
 
 def export_features(run: str | Path, scene: str, session: str, out: str | Path, kind: str = "sift") -> int:
-    """Write the features of a session, such as `ios_map`, as a file of hloc, and return the number of images.
+    """Write the features of a session, such as `ios_map`, as a file of hloc; return the number of images.
 
     Raise ArtifactError if the run has no such features, or several.
     """
@@ -346,13 +329,9 @@ def _to_hloc(features: LocalFeatures) -> dict[str, NDArray[Any]]:
     descriptors = features.descriptors
     if descriptors.dtype == np.uint8:  # without loss: a byte over a power of two has 8 significant bits, float16 has 11
         descriptors = (descriptors / np.float32(DESCRIPTOR_SCALE)).astype(np.float16)
-    return {
-        "keypoints": features.keypoints - _HALF_PIXEL,
-        "scales": features.scales,
-        "scores": features.scores,
-        "descriptors": np.ascontiguousarray(descriptors.T),
-        "image_size": np.array(features.image_size, np.int64),
-    }
+    size = np.array(features.image_size, np.int64)
+    arrays = {"keypoints": features.keypoints - _HALF_PIXEL, "scales": features.scales, "scores": features.scores}
+    return arrays | {"descriptors": np.ascontiguousarray(descriptors.T), "image_size": size}
 
 
 def import_features(path: str | Path, out: str | Path) -> FeatureStore:
@@ -482,12 +461,9 @@ def _opened(path: Path) -> h5py.File:
 
 def geo_table(run: str | Path, capture: str | Path | None = None) -> pd.DataFrame:
     """Return a row per query image of a run and map with an origin: `KEYS`, `georeference.GEO_COLUMNS`, `num_inliers`,
-    `position_std_m` and `path`, the file. The columns of the pose are NaN without a pose. `capture` is its folder, if
-    it has moved since the run.
+    `position_std_m` and `path`, the file. The columns of the pose are NaN without a pose.
 
-    Raises:
-        CaptureError: no map has an origin.
-        ArtifactError: there are no poses, or they are of older references or of an older map.
+    Raise CaptureError if no map has an origin; ArtifactError if there are no poses, or only outdated ones.
     """
     run, tables, refused = Path(run), list[pd.DataFrame](), list[CaptureError]()
     scenes = localized_scenes(run)
@@ -526,10 +502,8 @@ def _table_of(results: PairResults, session: Any, origin: Floats, scene: str) ->
 def export_geo(run: str | Path, out: str | Path, capture: str | Path | None = None) -> int:
     """Write `geo_table` as CSV, or as GeoJSON (RFC 7946), where images without a pose have no geometry.
 
-    Return the number of images with a pose.
-
-    Raises:
-        ManifestError: the file's name ends neither in .csv nor in .geojson; and as for `geo_table`.
+    Return the number of images with a pose. Raise ManifestError for another ending of the file's name; and as
+    `geo_table`.
     """
     out = Path(out)
     if out.suffix.lower() not in FORMATS:
@@ -555,11 +529,8 @@ def export_exif(
 
     With `xmp`, write XMP files with these tags instead, `a.xmp` of `a.jpg`, to lie beside the images. Of an image
     that was localized in several maps, the pose with the most inliers, then the surest, is taken; with `unsure`, also
-    one of low confidence. Times and other tags stay. Return the number of images.
-
-    Raises:
-        ManifestError: the folder `out` contains files; or two XMP files would have one name.
-        ImageError: an image cannot be read; and as for `geo_table`.
+    one of low confidence. Times and other tags stay. Return the number of images. Raise ManifestError if `out`
+    contains files, or two XMP files would have one name; ImageError if an image cannot be read; and as `geo_table`.
     """
     out = Path(out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -590,14 +561,12 @@ def export_exif(
 
 
 def _degrees(value: float) -> tuple[int, int, float]:
-    """Return whole degrees, whole minutes, and seconds."""
     parts = round(abs(value) * 3600 * _DENOMINATOR)
     minutes, seconds = divmod(parts, 60 * _DENOMINATOR)
     return *divmod(minutes, 60), seconds / _DENOMINATOR
 
 
 def _write_with_gps(source: Path, target: Path, row: Mapping[Any, Any]) -> None:
-    """Write a copy of an image with other GPS tags."""
     try:
         with PIL.Image.open(source) as image:
             exif, kind, jpeg = image.getexif(), image.format, source.read_bytes()

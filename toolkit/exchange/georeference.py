@@ -324,11 +324,10 @@ def origin_of(session: Session) -> Floats:
                 expected = f"expected the numbers {', '.join(GEO_COLUMNS[:3])}"
                 raise CaptureError(f"{session.path / name}: origin: found {origin!r}, {expected}.")
             return values
-    raise CaptureError(
-        f"{session.path}: the map has no origin on the Earth, so its poses have no latitude and longitude. Reconstruct "
-        f"it from photographs with GPS. Or, if its axes are east, north and up, in meters, write the key `origin` with "
-        f"{', '.join(GEO_COLUMNS[:3])} into {IMPORT_RECORD}."
-    )
+    fault = "the map has no origin on the Earth, so its poses have no latitude and longitude"
+    do = "Reconstruct it from photographs with GPS. Or, if its axes are east, north and up, in meters, write the key"
+    keys = f"`origin` with {', '.join(GEO_COLUMNS[:3])} into {IMPORT_RECORD}"
+    raise CaptureError(f"{session.path}: {fault}. {do} {keys}.")
 
 
 def _earth_fixed(geo: Floats) -> Floats:

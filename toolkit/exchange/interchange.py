@@ -2,11 +2,8 @@
 
 A folder of images may have a table, a CSV file with a header. Column `image` is the path in the folder; `qw qx qy qz tx
 ty tz` are the pose; `timestamp` is the time; `camera_id` names a camera in a COLMAP `cameras.txt`, or `model width
-height params` (params separated by spaces) give the camera directly. The order of columns is free; unknown columns are
-an error. A query list of hloc, `name MODEL width height parameters` per line, is accepted in place of the table; and
-lists of poses without names, see `recordings.read_track`.
-
-Panoramas show the whole sphere: each becomes the images of a rig of perspective cameras, all in one place.
+height params` (params separated by spaces) give the camera directly. In its place, hloc's query list, `name MODEL width
+height parameters` per line, is accepted, and lists of poses without names, see `recordings.read_track`.
 
 In transforms.json, nerfstudio and instant-ngp store images, cameras and poses. Each entry of `frames` may have these
 keys; keys it lacks are read from the top level of the file (not `file_path`):
@@ -104,14 +101,12 @@ def import_colmap(
 ) -> ImportReport:  # fmt: skip
     """Make a session from a COLMAP model and its images: cameras, poses, and the rigs that have several cameras.
 
-    The capture format supports all camera models of COLMAP, so they are kept without undistortion. Points and tracks
-    are dropped, because the toolkit triangulates its own map. Images of the folder that are not in the model are left
-    out and counted in the report.
+    Images of the folder that are not in the model are left out and counted; points and tracks are dropped, because the
+    toolkit triangulates its own map.
 
     Args:
         model: folder with cameras, images (and rigs, frames), as .bin or .txt; or the folder of one such folder.
         images: folder that the model's image names are relative to.
-        capture: folder of the capture; created if it does not exist.
         device, split: the session is `<device>_<split>`. Poses of queries become their ground truth.
         options: see `drafts.Options`.
 
@@ -170,16 +165,13 @@ def import_images(
 
     Args:
         images: folder; without a table, all JPEG and PNG files in and below it are imported.
-        capture, device, split: as for `import_colmap`. A map needs poses.
+        device, split: as for `import_colmap`. A map needs poses.
         table: CSV file, see the module's docstring.
         poses_are: direction of the poses in table and truth: `world_from_cam`, `cam_from_world`, or
-            `rotation_of_cam_from_world`, whose positions are the camera centers, as in NVM, Bundler and the Cambridge
-            Landmarks.
+            `rotation_of_cam_from_world`, whose positions are the camera centers, as in NVM and Bundler.
         camera: intrinsics of all images, `MODEL, width, height, parameter, ...`, with COLMAP's models.
-        cameras: COLMAP's cameras.txt. A single camera applies to all images; of several, the table's `camera_id`
-            selects one.
-        truth: CSV file like the table; its poses become the ground truth of queries. Images not in it are queries
-            without ground truth.
+        cameras: COLMAP's cameras.txt. One camera applies to all images; of several, the table's `camera_id` selects.
+        truth: CSV file like the table; its poses become the ground truth of queries, which some may lack.
         only, skip: patterns such as `*.color.png`, without a table; only images of these names, and none of those.
         options: see `drafts.Options`; `unit_m` is 1 by default.
 
@@ -241,13 +233,9 @@ def import_once(
 ) -> str:
     """Import images, unless the session was imported before from the same input. Return a message for the user.
 
-    Args:
-        unit_m: meters per unit of the poses; None: unknown.
-        options: as for `import_images`; `table` may be a transforms.json in the folder of images.
-
-    Raises:
-        CaptureError: the session was imported from other input (the message names it); or as for the imports.
-        ManifestError: not the folder of the transforms.json; or as for the imports.
+    Options are those of `import_images`; `table` may be a transforms.json in the folder of images. Raise CaptureError
+    if the session was imported from other input, which it names; ManifestError if the transforms.json is in another
+    folder; or as the imports.
     """
     session = Path(capture) / "sessions" / f"{device}_{split}"
     inputs: dict[str, Any] = {"images": str(Path(images).resolve()), **options}
@@ -294,9 +282,8 @@ def once(session: Path, inputs: Mapping[str, Any], make: Callable[[dict[str, Any
             else f"{name}: then {before.get(name)!r}, now {inputs[name]!r}"
             for name in differing
         )  # fmt: skip
-        raise CaptureError(
-            f"{session} was imported from other input ({changes}). Delete it to import again, or give another capture."
-        )
+        do = "Delete it to import again, or give another capture."
+        raise CaptureError(f"{session} was imported from other input ({changes}). {do}")
     return f"{session}: imported before from the same input, kept"
 
 
@@ -435,9 +422,8 @@ def read_intrinsics(table: Path) -> dict[str, pycolmap.Camera]:
 
 
 def _read_table(path: Path) -> pd.DataFrame:
-    """Read the table of a folder of images, all values as text, with the additional column `line`; with poses, also
-    column `problem`, why the pose of a row is none.
-    """
+    """Read the table of a folder of images, all values as text, with columns `line` and, with poses, `problem`, why the
+    pose of a row is none."""
     if _is_transforms(path):
         _read_transforms(path)
         raise CaptureError(f"{path}: not a CSV table. Import it by {COMMAND} import transforms.")
@@ -520,9 +506,8 @@ def import_transforms(
     image; ManifestError as for `drafts.start`.
 
     Args:
-        capture, device, split: as for `import_colmap`.
-        undo_applied: return to the world before `applied_transform` and `applied_scale`, as of the COLMAP model that
-            the file was made from.
+        device, split: as for `import_colmap`.
+        undo_applied: return to the world before `applied_transform` and `applied_scale`, as of the file's own input.
         own_split: without `hold_out`, the images of a map that the file names in `test_filenames` and `val_filenames`
             become queries.
         options: see `drafts.Options`; `axes` are `opengl` by default.
@@ -582,15 +567,12 @@ def import_transforms(
     return draft.finish(held if own_split else every_nth(sorted(frames), draft.hold_out))
 
 
-_OTHER_TOOLS = {
-    "shots": ("OpenSfM", "opensfm export_colmap"),
-    "sfm_data_version": ("OpenMVG", "openMVG_main_openMVG2Colmap"),
-}
-"""Tools that write a JSON file with a key, and their commands that export a COLMAP model."""
+# Tools that write a JSON file with this key, and their commands that export a COLMAP model.
+_OTHER_TOOLS = {"shots": ("OpenSfM", "opensfm export_colmap"),
+                "sfm_data_version": ("OpenMVG", "openMVG_main_openMVG2Colmap")}  # fmt: skip
 
 
 def _of_tool(path: Path, name: str, command: str) -> CaptureError:
-    """Return the error of a file of another tool, which exports a COLMAP model by a command."""
     do = f"Export a COLMAP model by `{command}`, and import that by `{COMMAND} import colmap`."
     return CaptureError.at(path, f"a file of {name}", "a table, or a transforms.json", do)
 
@@ -620,9 +602,7 @@ def _named(content: Mapping[str, Any], *keys: str) -> set[str]:
 
 
 def _frames_of(names: Iterable[str], frames: Mapping[str, "_TransformsFrame"]) -> dict[str, str]:
-    """Return the frames that names in lists of the file mean: that of the same path, else the only one of the same path
-    but for its extension.
-    """
+    """Return the frames that listed names mean: of the same path, else the only one that differs in its extension."""
     same = {frame.listed: name for name, frame in frames.items()}
     alike: dict[str, list[str]] = {}
     for name, frame in frames.items():
@@ -632,15 +612,12 @@ def _frames_of(names: Iterable[str], frames: Mapping[str, "_TransformsFrame"]) -
 
 
 def _without_suffix(image: str) -> str:
-    """Return an image's path without its extension, with forward slashes."""
     path = PurePosixPath(image.replace("\\", "/"))
     return str(path.with_suffix("") if path.suffix.lower() in READ_SUFFIXES else path)
 
 
 def _applied(path: Path, content: Mapping[str, Any]) -> tuple[Floats, float]:
-    """Return applied_transform (4, 4), a rigid motion, and applied_scale, above 0; the identity and 1 if they are
-    missing.
-    """
+    """Return applied_transform (4, 4), a rigid motion, and applied_scale, above 0; by default the identity and 1."""
     scale, rows = content.get("applied_scale", 1.0), content.get("applied_transform", np.eye(4))
     try:
         matrix = np.vstack([np.array(rows, np.float64)[:3], [0.0, 0.0, 0.0, 1.0]])
@@ -706,11 +683,8 @@ class _TransformsFrame:
         return matrix
 
     def camera(self) -> pycolmap.Camera:
-        """Return the intrinsics.
-
-        Raise ImageError if the file does not state the image size, and the image header cannot be read; CaptureError if
-        the intrinsics are missing or malformed.
-        """
+        """Return the intrinsics. Raise ImageError if the image's size is neither stated nor in a header that can be
+        read; CaptureError if they are missing or malformed."""
         pixels = "pixels, a number"
         size = [self._number(key, pixels) for key in "wh" if key in self.values]
         width, height = size if len(size) == 2 else map(float, read_header(self.path.parent / self.name)[0])
@@ -762,17 +736,11 @@ def import_panoramas(
 ) -> ImportReport:  # fmt: skip
     """Make a session of equirectangular panoramas: a map with poses, or queries, whose poses become ground truth.
 
-    The frame of a panorama is that of COLMAP's EQUIRECTANGULAR: z points to the center of the image, x to the right,
-    y down. It is the frame of the rig, so the pose of a query is that of its panorama. The ground and the sky more than
-    45 degrees from the horizon are left out. A mask of a panorama is cut as well, see `images.find_mask`. Raise
-    CaptureError for a malformed table, a map without poses, two panoramas of one name, the session exists already, or
-    no panorama is left; ManifestError as for `import_images`.
-
-    Args:
-        images: folder of JPEG and PNG files.
-        capture, device, split: as for `import_colmap`.
-        table, poses_are: as for `import_images`, with a row for each panorama.
-        options: see `drafts.Options`; `unit_m` is 1 by default.
+    Each becomes the images of a rig of perspective cameras, all in one place. The frame of a panorama is that of
+    COLMAP's EQUIRECTANGULAR: z points to the center of the image, x to the right, y down; it is the frame of the rig.
+    The ground and the sky more than 45 degrees from the horizon are left out. A mask of a panorama is cut as well, see
+    `images.find_mask`. Arguments are as for `import_images`. Raise CaptureError for a malformed table, a map without
+    poses, two panoramas of one name, the session exists already, or no panorama is left; ManifestError as there.
     """
     folder = Path(images)
     options["placing"], masks = "copy", options.pop("masks", None)  # masks are cut here

@@ -50,9 +50,7 @@ class Track:
 
 
 def read_text(path: Path, errors: str = "strict") -> str:
-    """Return the content of a text file in UTF-8 or UTF-16, as spreadsheets write it; raise CaptureError if it has
-    none.
-    """
+    """Return the content of a text file in UTF-8 or UTF-16, as of spreadsheets; raise CaptureError if it has none."""
     try:
         return path.read_text(encoding=encoding_of(path), errors=errors)
     except (OSError, UnicodeError) as error:

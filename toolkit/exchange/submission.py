@@ -49,7 +49,7 @@ class Submission:
 
     path: Path
     description: str
-    poses: dict[str, Trajectory]  # the poses of each pair that has some, by the name of its file
+    poses: dict[str, Trajectory]  # of each pair that has some, by the name of its file
     queries: pd.DataFrame  # one row per query of `COLUMNS_OF_QUERIES`; `pose` is a key of `ORIGINS`
     table: pd.DataFrame  # one row per pair: file, the numbers `COUNTS`, state (`complete`, or what is missing)
 
@@ -59,7 +59,6 @@ class Submission:
         return [name for name in self.table["file"] if name not in self.poses]
 
     def text(self) -> str:
-        """Return the table, its totals and the missing pairs as text."""
         table, total = self.table.to_string(index=False, justify="left"), self.table[COUNTS].sum()
         sums = f"{len(self.poses)} of {len(self.table)} pairs, {total['written']} poses for {total['asked']} queries."
         return f"{table}\n\n{sums}" + (f"\nMissing: {', '.join(self.missing)}." if self.missing else "")
@@ -89,14 +88,10 @@ def collect(
 ) -> Submission:  # fmt: skip
     """Collect and check the poses of runs for submission; `.write()` then writes the zip file.
 
-    The arguments are those of `visloc submit`. If the runs contain a scene of the challenge, all its scenes
-    and pairs are expected, else those of their captures.
-
-    Raises:
-        ManifestError: an unknown value, no such run, or no such description.
-        ArtifactError: two runs have the same pair, the poses of a sequence were made from other poses of single
-            queries, or a poses file has a duplicate key or a quaternion that is not of unit length.
-        CaptureError: a malformed poses file, or no such keyframe list; names file and line.
+    The arguments are those of `visloc submit`. If the runs contain a scene of the challenge, all its scenes and pairs
+    are expected, else those of their captures. Raise ManifestError for an unknown value, run or description;
+    ArtifactError if two runs have the same pair, poses are outdated, or a poses file has a duplicate key or a wrong
+    quaternion; CaptureError, with file and line, for a malformed file or no such keyframe list.
     """
     require_known("failed", failed, FAILED)
     folders = [Path(run) for run in runs]
@@ -118,17 +113,16 @@ def collect(
                 if len(found) > 1:
                     both = " and ".join(map(str, found))
                     raise ArtifactError(f"Two runs have poses of the same pair: {both}. Give one of the two runs.")
-                where = f"{'of the stage `sequence` ' if sequence else ''}in {', '.join(map(str, folders))}"
-                state = f"missing: no poses {where}"
-                if found:
-                    path = found[0]
+                of = "of the stage `sequence` " if sequence else ""
+                state = f"missing: no poses {of}in {', '.join(map(str, folders))}"
+                for path in found:
                     if sequence:
                         require_current(path, "sequence")
                     keyframes = capture_of(scene)[f"{pair[1]}_query"].keyframes(queries or QUERIES)
                     poses[name], table, not_asked = _answers(paths[path], pair, path, keyframes, failed)
                     tables.append(table.assign(file=name))
-                    of = table["pose"].value_counts().reindex([*ORIGINS], fill_value=0).tolist()
-                    counts = dict(zip(COUNTS, [len(table), len(poses[name]), *of, not_asked], strict=True))
+                    by_origin = table["pose"].value_counts().reindex([*ORIGINS], fill_value=0).tolist()
+                    counts = dict(zip(COUNTS, [len(table), len(poses[name]), *by_origin, not_asked], strict=True))
                     notes = [f"{counts[key]} {key.replace('_', ' ')}" for key in NOTED if counts[key]]
                     state = ", ".join(notes) or "complete"
                 rows.append({"file": name, **counts, "state": state})
@@ -176,7 +170,6 @@ def open_captures(
 
 
 def _description(text: str) -> str:
-    """Return the text, or the content of the file with this name."""
     if os.path.isfile(text):  # noqa: PTH113 - Path.is_file raises an error for a long text
         text = Path(text).read_text(encoding="utf-8", errors="replace")
     elif text.endswith(".txt") and len(text.split()) == 1:
@@ -230,9 +223,7 @@ def _read_poses(path: Path) -> Trajectory:
 
 
 def _nearest_references(path: Path) -> tuple[dict[Key, Floats], str]:
-    """Return world_from_device (4, 4) of queries from their best reference, and why other queries have none: of all
-    cameras, the one whose first reference has the best score.
-    """
+    """Return world_from_device (4, 4) of queries by the best first reference of their cameras; why others have none."""
     if not path.is_file():
         return {}, f"no retrieval to fill it from: {path} is missing"
     best: dict[Key, tuple[float, Floats]] = {}

@@ -672,9 +672,7 @@ class MutualMatcher:
 
 
 def unit_descriptors(descriptors: Descriptors, shorten: Shorten | None = None) -> NDArray[np.float32]:
-    """Return the descriptors (N, D) of `LocalFeatures` as float32 vectors of length about 1; for `shorten` see
-    `FeatureKind`.
-    """
+    """Return descriptors (N, D) as float32 vectors of length about 1; for `shorten` see `FeatureKind`."""
     vectors = descriptors.astype(np.float32, copy=False)
     if descriptors.dtype == np.uint8:
         vectors = vectors * np.float32(1.0 / DESCRIPTOR_SCALE)

@@ -313,9 +313,7 @@ class Verifier:
         references: Sequence[str],
         cameras: Sequence[pycolmap.Camera],
     ) -> tuple[list[int], list[int]]:
-        """Return the numbers of verified and of all matches of a query image with map images, given by name; 0 without
-        features.
-        """
+        """Return the numbers of verified and of all matches of a query image with map images; 0 without features."""
         features, counts = self._strongest(features), np.zeros((2, len(references)), np.int64)
         readable = [index for index, name in enumerate(references) if name in self.store]
         map_features = [self._map_features(references[index]) for index in readable]

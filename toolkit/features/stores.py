@@ -280,9 +280,7 @@ def _extract(
 
 
 def matches_path(out: str | Path, session0: str, session1: str, made_by: Mapping[str, Any]) -> Path:
-    """Return the folder of the matches of two sessions; `made_by` has `features`, a list with those of each, and
-    `matcher`.
-    """
+    """Return the folder of the matches of two sessions; `made_by` has the `features` of each, and `matcher`."""
     features, matcher = made_by["features"][0].get("name", "features"), made_by["matcher"]["name"]
     return Path(out) / f"{session0}-{session1}" / f"{features}-{matcher}-{fingerprint(made_by)}"
 

@@ -244,9 +244,7 @@ def _digits(value: float) -> str:
 
 
 def reason_in_words(result: QueryResult, numbers: Mapping[str, float], settings: LocalizeSettings) -> str:
-    """Return in a sentence why a query has its status; `numbers` are the known ones of `LABELS`, `settings` hold the
-    limits.
-    """
+    """Return why a query has its status; `numbers` are the known ones of `LABELS`, `settings` hold the limits."""
     detail = result.reason
     if result.status is Status.FAILED:
         said = [_why_failed(detail, int(numbers.get("num_matches", 0)), settings.pnp.min_inliers)]

@@ -222,9 +222,7 @@ def _marks(pair: SequencePair, session: Session, length: float) -> dict[str, Flo
 
 @styled
 def draw_steps(table: pd.DataFrame) -> "Figure":
-    """Draw the recall after each step, of `SequencePair.recalls` of pairs: a panel per threshold, a dot per pair, a bar
-    for their mean.
-    """
+    """Draw `SequencePair.recalls` after each step: a panel per threshold, a dot per pair, a bar for their mean."""
     columns = [name for name in table.columns if name.startswith("recall@")]
     steps = list(dict.fromkeys(table["step"]))
     figure = new_figure(1.5 + 3.4 * len(columns), 3.6)

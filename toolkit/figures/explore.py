@@ -81,9 +81,7 @@ def list_poses(path: str | Path) -> pd.DataFrame:
 
 
 def list_unsure(paths: Iterable[str | Path]) -> pd.DataFrame:
-    """Return the queries of pairs, `.csv` each, whose pose is not `ok`: devices, image, status with its reason,
-    inliers.
-    """
+    """Return the queries of pairs, `.csv` each, whose pose is not `ok`: devices, image, status, inliers."""
     tables = []
     for results in map(PairResults.open, paths):
         (mapped, queried), table = results.devices, results.table

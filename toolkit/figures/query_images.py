@@ -35,9 +35,7 @@ MAX_LETTERS = 50
 
 
 def shown_name(name: str, most: int = 1000) -> str:
-    """Return an image's name as the user knows it: without its session; of a name longer than `most` letters, that of
-    the file, and of that the end.
-    """
+    """Return an image's name without its session; of one longer than `most` letters, the end of the file's name."""
     name = own_name(name.rpartition("/raw_data/")[2])
     name = name if len(name) <= most else f"…/{name.rpartition('/')[2]}"
     return name if len(name) <= most else f"…{name[1 - most :]}"

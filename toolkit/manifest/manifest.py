@@ -388,9 +388,7 @@ def _read_yaml(path: Path, heir: Path | None = None) -> dict[str, Any]:
 
 
 def _parse_yaml(text: str) -> Any:
-    """Return the content of a YAML text; raise yaml.YAMLError for an invalid one, or for aliases that expand to too
-    much.
-    """
+    """Return the content of a YAML text; raise yaml.YAMLError for an invalid one, or aliases that expand too far."""
     loader = yaml.SafeLoader(text)
     try:
         node = loader.get_single_node()

@@ -128,10 +128,8 @@ def _check_models(model: str | list[str]) -> str | list[str]:
 
 def _check_index(index: str) -> str:
     if not re.fullmatch(r"(PCA\d+,)?(Flat|RaBitQ|HNSW\d+|IVF\d+,(Flat|RaBitQ|PQ\d+(x\d+)?))", index):
-        raise ValueError(
-            f"found {index!r}, expected Flat, RaBitQ, HNSW<links>, or IVF<cells> followed by Flat, RaBitQ or "
-            "PQ<codes>, behind PCA<dimensions> or not, such as PCA512,IVF4096,RaBitQ"
-        )
+        kinds = "Flat, RaBitQ, HNSW<links>, or IVF<cells> with Flat, RaBitQ or PQ<codes>, perhaps after PCA<dimensions>"
+        raise ValueError(f"found {index!r}, expected {kinds}, such as PCA512,IVF4096,RaBitQ")
     return index
 
 

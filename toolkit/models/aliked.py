@@ -225,9 +225,7 @@ def _weighted_sum(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
 
 
 def _corners(positions: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Return the indices, into the flattened map, and weights, both (..., 4), of the four pixels of a map (H, W) around
-    positions (..., 2), x y.
-    """
+    """Return flat indices and weights, both (..., 4), of the four pixels of a map (H, W) around x, y (..., 2)."""
     axes = []
     for position, length in ((positions[..., 1], shape[0]), (positions[..., 0], shape[1])):
         low = position.floor()

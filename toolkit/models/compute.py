@@ -179,10 +179,8 @@ def on_device(model: "torch.nn.Module", device: "torch.device", title: str) -> "
         if not is_out_of_memory(error):
             raise
         reason = first_line(error)
-    raise ToolkitError(
-        f"The memory of {device} does not hold the weights of {title} ({reason}). Free some, use dtype_compute: "
-        "bfloat16, or compute_device: cpu."
-    )
+    do = "Free some, use dtype_compute: bfloat16, or compute_device: cpu."
+    raise ToolkitError(f"The memory of {device} does not hold the weights of {title} ({reason}). {do}")
 
 
 @contextmanager
@@ -275,10 +273,9 @@ class Fitting:
                 reason = first_line(error)
             # Not in the handler, whose traceback would keep the tensors of the failed attempt alive.
             if count == 1:
-                raise ToolkitError(
-                    f"The memory of {device} does not hold the network with one of the {self._what} "
-                    f"({reason}). Use a smaller image_size, dtype_compute: bfloat16, or compute_device: cpu."
-                )
+                fault = f"The memory of {device} does not hold the network with one of the {self._what} ({reason})"
+                do = "Use a smaller image_size, dtype_compute: bfloat16, or compute_device: cpu."
+                raise ToolkitError(f"{fault}. {do}")
             self._limit = count // 2
             log.warning("%d %s do not fit the memory of %s, continuing with %d at a time",
                         count, self._what, device, self._limit)  # fmt: skip

@@ -47,9 +47,7 @@ _NAMES = {
 
 
 def official_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Rename the tensors of a checkpoint, the authors' or one of the package `transformers`, to those of `LightGlue`;
-    unknown names stay unchanged.
-    """
+    """Rename the tensors of a checkpoint, the authors' or of `transformers`, to those of `LightGlue`; others stay."""
     renamed = {}
     for name, value in state.items():
         for pattern, own in _NAMES.items():
@@ -259,9 +257,7 @@ class LightGlue(nn.Module):
     def _assign(
         self, a: Tensor, b: Tensor, mask_a: Tensor | None, mask_b: Tensor | None, number: int
     ) -> tuple[Tensor, Tensor]:
-        """Return mutual best matches after a layer, by the sum of the log softmax over rows and over columns; see
-        `forward`.
-        """
+        """Return mutual best matches after a layer, by the log softmax over rows plus that over columns."""
         layer = self.log_assignment[number]
         scores = layer.final_proj(a) @ (layer.final_proj(b) / DIM**0.5).mT
         for mask, dim in ((mask_a, 2), (mask_b, 1)):

@@ -155,15 +155,12 @@ class MegaLoc(nn.Module):
             ValueError: wrong shape, or too small: the aggregation needs more patches of 14 x 14 pixels than clusters.
         """
         if images.ndim != 4 or images.shape[1] != 3 or not images.is_floating_point():
-            raise ValueError(
-                f"images are {images.dtype} {tuple(images.shape)}; expected (B, 3, H, W), ImageNet-normalized."
-            )
+            found = f"{images.dtype} {tuple(images.shape)}"
+            raise ValueError(f"images are {found}; expected (B, 3, H, W), ImageNet-normalized.")
         height, width = (round(side / PATCH) for side in images.shape[2:])  # half to even, as the official code
         if height * width <= self.clusters:
-            raise ValueError(
-                f"images of {images.shape[3]} x {images.shape[2]} pixels give {height * width} patches of "
-                f"{PATCH} x {PATCH}; expected more than {self.clusters}. Enlarge them."
-            )
+            given = f"images of {images.shape[3]} x {images.shape[2]} pixels give {height * width} patches"
+            raise ValueError(f"{given} of {PATCH} x {PATCH}; expected more than {self.clusters}. Enlarge them.")
         size = [height * PATCH, width * PATCH]
         if list(images.shape[2:]) != size:
             images = F.interpolate(images.float(), size, mode="bilinear", align_corners=False, antialias=True)

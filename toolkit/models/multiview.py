@@ -280,10 +280,8 @@ class Loader:
             image = _open_image(source)
             if not min(self.fit(image.size, mode)[0]):
                 where = source if isinstance(source, str | Path) else f"no. {position}"
-                raise ImageError(
-                    f"Image of {image.width} x {image.height} pixels is too elongated for the network: {where}. Its "
-                    f"shorter side would be less than half a patch of {PATCH} pixels; crop it."
-                )
+                fault = f"Image of {image.width} x {image.height} pixels is too elongated for the network: {where}"
+                raise ImageError(f"{fault}. Its shorter side would be less than {PATCH / 2:g} pixels. Crop it.")
             shown.append(self.show(image, mode))
             sizes.append(image.size)
         layout = self.lay_out(sizes, mode)
@@ -475,10 +473,8 @@ class MultiView(nn.Module):
             patch_tokens = self.encode(images.flatten(0, 1)).unflatten(0, (B, S))
         expected = (B, S, self.class_tokens + H // self.patch * (W // self.patch), self.channels)
         if patch_tokens.shape != expected:
-            raise ValueError(
-                f"patch_tokens have shape {tuple(patch_tokens.shape)}; expected {expected} for images of shape "
-                f"{tuple(images.shape)}."
-            )
+            found = f"patch_tokens of shape {tuple(patch_tokens.shape)}, images of shape {tuple(images.shape)}"
+            raise ValueError(f"{found}: expected tokens of {expected}.")
         return self._predictions(patch_tokens, heads, (H, W), **options)
 
     def _predictions(self, tokens: Tensor, heads: tuple[str, ...], size: tuple[int, int]) -> dict[str, Any]:
@@ -488,10 +484,8 @@ class MultiView(nn.Module):
     def _check_images(self, images: Tensor, axes: str) -> None:
         channels, height, width = images.shape[-3:] if images.ndim == len(axes.split(",")) else (0, 0, 0)
         if channels != 3 or height % self.patch or width % self.patch or not images.numel():
-            raise ValueError(
-                f"images have shape {tuple(images.shape)}; expected {axes}, at least one image, with height and width "
-                f"that are multiples of {self.patch}. `load_images` makes such images."
-            )
+            expected = f"{axes}, at least one image, height and width multiples of {self.patch}, as by `load_images`"
+            raise ValueError(f"images have shape {tuple(images.shape)}; expected {expected}.")
 
 
 def _ordered_heads(heads: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:

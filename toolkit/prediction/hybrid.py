@@ -176,9 +176,7 @@ class DepthLifter:
         return LiftedMap(part, triangulated, np.concatenate([np.full(len(triangulated), -1), lifted_from]), depths)
 
     def _find_log_scale(self, image: int) -> float:
-        """Return the logarithm of the depth of depth maps, divided by that of the triangulated points of an image, in
-        the median; NaN if it has too few of them.
-        """
+        """Return the median log ratio of depth maps to an image's triangulated points; NaN if it has too few."""
         local_map = self._first.map
         keypoints, points = local_map.observations(image)
         depth_m = self._seen_depth(image).at(self._first.features[local_map.image_names[image]].keypoints[keypoints])

@@ -190,10 +190,8 @@ class Architecture:
         """
         network = getattr(self._imported, self.network).from_checkpoint(checkpoint, heads=HEADS, compute_dtype=dtype)
         if self.channels not in (None, network.channels):
-            raise WeightsError(
-                f"{checkpoint}: these are weights with {network.channels} channels, not {self.title}, which has "
-                f"{self.channels}. Correct `{self.weights.setting}`, or the predictor's name."
-            )
+            fault = f"these are weights with {network.channels} channels, not {self.title}, which has {self.channels}"
+            raise WeightsError(f"{checkpoint}: {fault}. Correct `{self.weights.setting}`, or the predictor's name.")
         return network
 
     def read(self, image: Path | NDArray[np.uint8], layout: "Layout") -> "tuple[Tensor, Size]":

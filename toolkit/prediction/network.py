@@ -136,10 +136,8 @@ class SimulatedPredictor:
         names = sorted(view.name for view in group)
         for view in group:
             if view.name not in self._truth or not np.isfinite(self._truth[view.name]).all():
-                raise CaptureError(
-                    f"The simulated predictor has no true pose of {view.name}: it works only if "
-                    "queries have ground truth in proc/alignment_trajectories.txt. Use another predictor or method."
-                )
+                do = "Put one into proc/alignment_trajectories.txt, or use another predictor or method."
+                raise CaptureError(f"The simulated predictor has no true pose of {view.name}. {do}")
         true = np.stack([self._truth[view.name] for view in group])
         noisy = np.stack([self._noisy(pose, names, view, true) for pose, view in zip(true, group, strict=True)])
         rng = self._random(names)

@@ -133,15 +133,11 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
     unit = unit_of(*limits[0])
     for folder, record, table, limit in zip(folders, records, tables, limits, strict=True):
         if unit_of(*limit) != unit:
-            raise ArtifactError(
-                f"{folder}: found errors in {unit_of(*limit)}, expected {unit} as in {folders[0]}. Set the same `unit` "
-                "for both, and run them again."
-            )
+            do = "Set the same `unit` for both, and run them again."
+            raise ArtifactError.at(folder, f"errors in {unit_of(*limit)}", f"{unit} as in {folders[0]}", do)
         if table.duplicated(keys).any():
-            raise ArtifactError(
-                f"{folder}: evaluation/errors.csv has a query twice, expected one row each. Perhaps this run was "
-                "evaluated at each camera and the others at each device; evaluate it with the same `at` as the others."
-            )
+            do = "If `at` differs (each camera, each device), evaluate it with the same `at` as the others."
+            raise ArtifactError(f"{folder}: evaluation/errors.csv has a query twice, expected one row each. {do}")
         if record["status"] not in ("done", ""):
             messages.append(f"{folder.name} is {record['status']}: {record['error'] or 'it has not ended'}")
         if limit != limits[0]:
@@ -151,9 +147,8 @@ def compare_runs(run_dirs: Sequence[str | Path], seed: int = SEED, resamples: in
     queries = pd.concat([images, *results], axis="columns", join="inner").reset_index()
     counts = ", ".join(f"{name} {len(table)}" for name, table in zip(names, tables, strict=True))
     if queries.empty:
-        raise ArtifactError(
-            f"The runs have no query in common ({counts}). Compare runs of the same capture, pairs and queries."
-        )
+        do = "Compare runs of the same capture, pairs and queries."
+        raise ArtifactError(f"The runs have no query in common ({counts}). {do}")
     if any(len(table) > len(queries) for table in tables):
         messages.append(f"The runs have different queries ({counts}); only the {len(queries)} in common are compared.")
     for scene in queries["scene"].unique():
@@ -223,10 +218,8 @@ def _read_errors(folder: Path, record: Mapping[str, Any]) -> pd.DataFrame:
         raise ArtifactError(f"{folder}: not evaluated ({missing}). Finish the run: {COMMAND} run MANIFEST.")
     errors = pd.concat(tables, ignore_index=True).dropna(subset=_ERRORS)
     if errors.empty:
-        raise ArtifactError(
-            f"{folder}: found no query with ground truth, expected at least one: recall needs true poses. Add ground "
-            "truth to the query sessions and evaluate again."
-        )
+        do = "Add ground truth to the query sessions and evaluate again."
+        raise ArtifactError.at(folder, "no query with ground truth", "at least one: recall needs true poses", do)
     return errors
 
 

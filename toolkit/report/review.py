@@ -83,9 +83,7 @@ def readable(table: pd.DataFrame, thresholds: Sequence[str]) -> pd.DataFrame:
 
 
 def write_tables(stem: Path, table: pd.DataFrame, shown: pd.DataFrame, caption: str) -> list[Path]:
-    """Write the main table, and `shown`, the same as texts, as `<stem>.csv` and as `<stem>.tex`, no wider than the
-    page.
-    """
+    """Write the main table as `<stem>.csv`, and `shown`, its texts, as `<stem>.tex`, no wider than the page."""
     paths = [stem.with_name(f"{stem.name}{ending}") for ending in (".csv", ".tex")]
     if table.empty:
         for path in paths:
@@ -140,9 +138,7 @@ def _rows(path: Path) -> int:
 
 
 def method(files: SceneFiles, reranked: bool) -> str:
-    """Return how queries were localized, from references or `reranked` ones, in sentences that can be quoted, from the
-    settings beside the results.
-    """
+    """Return how queries were localized, by the settings beside the results, in sentences that can be quoted."""
     said = list[str]()
     embed, retrieve = _settings(files.embeddings, EmbedSettings), _settings(files.retrieval_dir, RetrieveSettings)
     rerank = _settings(files.reranked_dir, RerankSettings) if reranked else None

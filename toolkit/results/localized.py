@@ -240,9 +240,7 @@ def query_details(
     map_session: Session,
     world_from_rig_true: Floats | None = None,
 ) -> QueryDetails:
-    """Return images, at their poses rig_from_cam (C, 4, 4), correspondences and references of a query, given its
-    result.
-    """
+    """Return images, at their poses rig_from_cam (C, 4, 4), correspondences and references of a query."""
     unknown = np.full((4, 4), np.nan)
     pose = unknown if result.world_from_rig is None else result.world_from_rig
     true = unknown if world_from_rig_true is None else world_from_rig_true

@@ -37,9 +37,7 @@ UNKNOWN_UNIT = "L"
 
 
 def length_unit(record: Mapping[str, Any]) -> tuple[str, float]:
-    """Return the unit that lengths in a map are shown in, and its length in the unit of the poses, from the localize
-    stage's record of the map.
-    """
+    """Return the unit that a map's lengths are shown in, and its length in that of the poses, by the map's record."""
     return ("m", 1.0) if record["unit"] or not record["depth"] else (UNKNOWN_UNIT, record["depth"] / 10)
 
 

@@ -177,9 +177,8 @@ class PairResults:
         try:
             return QueryResult.from_arrays(read_group(self._file, name))
         except (*HDF5_ERRORS, AttributeError) as error:
-            raise DamagedError(
-                self.h5, f"{self.h5}: {name} is not as a run writes it ({first_line(error)}). Localize again."
-            ) from None
+            fault = f"{self.h5}: {name} is not as a run writes it ({first_line(error)}). Localize again."
+            raise DamagedError(self.h5, fault) from None
 
     def errors(self, truth: Trajectory | Floats) -> pd.DataFrame:
         """Return the table with `rotation_error_deg` and `translation_error_m`, by `metrics.pose_errors`; or `_L`.
@@ -205,9 +204,8 @@ def _open(h5: Path) -> h5py.File:
     try:
         return h5py.File(h5, "r")
     except HDF5_ERRORS as error:
-        raise ArtifactError(
-            f"{h5}: the correspondences of the poses cannot be read ({error}). Localize again."
-        ) from None
+        fault = f"the correspondences of the poses cannot be read ({error})"
+        raise ArtifactError(f"{h5}: {fault}. Localize again.") from None
 
 
 def names_of_maps(h5: Path) -> list[str]:
@@ -336,9 +334,7 @@ def _unreadable(path: Path, error: Exception) -> ArtifactError:
 
 
 def how_localized(pair: Path) -> Localized:
-    """Return how the queries of a pair, `poses/<pair>.h5`, were localized; raise ArtifactError if the file does not say
-    it.
-    """
+    """Return how the queries of `poses/<pair>.h5` were localized; raise ArtifactError if the file does not say it."""
     try:
         with h5py.File(pair, "r") as file:
             attributes = dict(file.attrs)
@@ -366,9 +362,7 @@ def last_localized(files: SceneFiles, pairs: Sequence[Path]) -> Localized:
 
 
 def read_settings(path: Path, model: type[AnySettings]) -> AnySettings:
-    """Return the settings that a stage wrote beside its results; raise ArtifactError if it did not, or in another
-    version.
-    """
+    """Return the settings beside a stage's results; raise ArtifactError if missing or of another version."""
     try:
         return model.of(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, ManifestError) as error:
@@ -395,9 +389,7 @@ def session_fingerprint(session: Session) -> str:
 
 
 def map_inputs(session: Session, features: FeatureStore) -> str:
-    """Return 16 hex digits that identify what a map is made of, `inputs` of its record: its session and the features of
-    its images.
-    """
+    """Return 16 hex digits that identify a map's `inputs`: its session and the features of its images."""
     return fingerprint([session_fingerprint(session), features.only(session.image_names).fingerprint])
 
 

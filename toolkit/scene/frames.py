@@ -95,9 +95,8 @@ def localize_sequence(
     first = cams[0] if isinstance(cams, list | tuple) and rig_from_cams is not None else cams
     cams_of_frames = list(cams) if isinstance(first, list | tuple) else [cams] * len(images)
     if len(cams_of_frames) != len(images):
-        raise ValueError(
-            f"Found {len(cams_of_frames)} cameras and {len(images)} images: expected one for all, or one per image."
-        )
+        expected = "expected one for all, or one per image"
+        raise ValueError(f"Found {len(cams_of_frames)} cameras and {len(images)} images: {expected}.")
     localize = partial(_localize, scene_map, rig_from_cams, turns)
     single = {frame: localize(image, cams_of_frames[frame]) for frame, image in enumerate(images) if image is not None}
     piece, relocalized = np.zeros(len(odometry), int), dict[int, QueryResult]()

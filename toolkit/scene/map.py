@@ -527,10 +527,10 @@ class Map:
         if self._unmapped and not settings.predicts:
             return self._on_demand_localizer(self._unmapped)
         if not self.mapped:
-            raise ArtifactError(
-                f"The map of {self.device!r} was built for another method than {settings.method!r} and has no points, "
-                f"which it needs. Localize with {settings.method!r} first."
+            fault = (
+                f"The map of {self.device!r} was built for another method than {settings.method!r} and has no points"
             )
+            raise ArtifactError(f"{fault}, which it needs. Localize with {settings.method!r} first.")
         pnp = PnpLocalizer(self.in_lengths, settings.pnp, settings.seed)
         if settings.method != "feed_forward":
             for kind in self.in_lengths:
@@ -711,9 +711,7 @@ class Located:
         answer: Callable[[QueryResult], "Answer"],
         open_query: Callable[[], tuple[Map, Query, Sequence[References]]],
     ) -> None:
-        """`answer` returns how the query was localized, given one of its results; `open_query` what is needed to do it
-        again.
-        """
+        """`answer` returns how the query was localized, given a result; `open_query` what is needed to do it again."""
         self.answer, self.open = answer, open_query
 
     def __deepcopy__(self, memo: Any) -> "Located":
@@ -787,10 +785,8 @@ class ReferenceSearch:
         """
         for embedder, described, dim in zip(self.embedders, query.descriptors, self._stored[0].dims, strict=True):
             if described.shape[1] != dim:
-                raise ArtifactError(
-                    f"{self.files.embeddings}: found descriptors of {dim} dimensions for the map, expected "
-                    f"{described.shape[1]} of {embedder.name}. Run the embed stage again."
-                )
+                found, expected = f"map descriptors of {dim} dimensions", f"{described.shape[1]} of {embedder.name}"
+                raise ArtifactError.at(self.files.embeddings, found, expected, "Run the embed stage again.")
         searched = np.hstack([self._as_searched(vectors) for vectors in query.descriptors])
         topk = self.retrieve_settings.topk if k is None or self.reranked else k
         masks = list(allowed) or [None] * len(searched)
@@ -862,10 +858,8 @@ class ReferenceSearch:
         ]
         for embedder, vectors in zip(embedders, self._stored[0].parts.values(), strict=True):
             if vectors.embedder not in ("", embedder_fingerprint(embedder.settings)):
-                raise ArtifactError(
-                    f"{vectors.paths[0]} was made by another embedder or vocabulary than the run's {embedder.name} of "
-                    "now. Run the embed stage again."
-                )
+                fault = f"was made by another embedder or vocabulary than the run's {embedder.name} of now"
+                raise ArtifactError(f"{vectors.paths[0]} {fault}. Run the embed stage again.")
         return embedders
 
     @cached_property

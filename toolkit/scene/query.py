@@ -85,10 +85,8 @@ def query_from(
     poses = np.eye(4)[None] if rig_from_cams is None else _poses(rig_from_cams)
     quarter_turns = [0] * len(cameras) if turns is None else _turns(turns)
     if not 0 < len(images) == len(cameras) == len(poses) == len(quarter_turns):
-        raise CameraError(
-            f"Found {len(images)} images, {len(cameras)} cameras, {len(poses)} rig_from_cams and "
-            f"{len(quarter_turns)} turns: expected the same number of each, and at least one."
-        )
+        found = f"{len(images)} images, {len(cameras)} cameras, {len(poses)} rig_from_cams, {len(quarter_turns)} turns"
+        raise CameraError(f"Found {found}: expected the same number of each, and at least one.")
     pixels = [Path(one) if isinstance(one, str | Path) else pixels_from(one) for one in images]
     numbered = enumerate(zip(pixels, cameras, quarter_turns, strict=True), start=1)
     masks = [find_mask(one) if isinstance(one, Path) else None for one in pixels]
@@ -253,10 +251,8 @@ def _are_several(image: Any) -> bool:
 def _check_camera(camera: Any) -> None:
     """Raise CameraError if an object is not a camera with valid intrinsics."""
     if not isinstance(camera, pycolmap.Camera):
-        raise CameraError(
-            f"camera: found {camera!r}, a {type(camera).__name__}; expected a pycolmap.Camera. To make one: "
-            "parse_camera('camera', 'PINHOLE, 640, 480, 500, 500, 320, 240') of toolkit.capture."
-        )
+        do = "Make one by toolkit.capture.parse_camera('camera', 'PINHOLE, 640, 480, 500, 500, 320, 240')."
+        raise CameraError.at("camera", f"{camera!r}, a {type(camera).__name__}", "a pycolmap.Camera", do)
     try:
         parse_camera("camera", camera_text(camera))
     except ValueError as error:
@@ -276,10 +272,9 @@ def _poses(rig_from_cams: Any) -> NDArray[np.float64]:
     deviations = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(axis=(1, 2))
     deviations = np.maximum(deviations, np.abs(poses[:, 3] - [0, 0, 0, 1]).max(axis=1))
     for number in np.flatnonzero((deviations > _MAX_DEVIATION) | (np.linalg.det(rotations) < 0))[:1].tolist():
-        raise CameraError(
-            f"rig_from_cams: found no pose for image {number + 1}: {poses[number].tolist()}. Expected a rotation, "
-            "which neither scales nor mirrors, a translation, and 0, 0, 0, 1 in the last row."
-        )
+        found = f"no pose for image {number + 1}: {poses[number].tolist()}"
+        expected = "a rotation, which neither scales nor mirrors, a translation, and a last row 0, 0, 0, 1"
+        raise CameraError.at("rig_from_cams", found, expected)
     return poses
 
 
@@ -332,10 +327,8 @@ def what_if(
 
     sections = nested(changes)
     for section in sections.keys() - {"localize", "retrieve"}:
-        raise ManifestError(
-            f"{section}: cannot change for one query. {nearest(section, CHANGEABLE)} "
-            f"To change it for all queries: {COMMAND} run MANIFEST --set {section}..."
-        )
+        do = f"{nearest(section, CHANGEABLE)} To change it for all queries: {COMMAND} run MANIFEST --set {section}..."
+        raise ManifestError(f"{section}: cannot change for one query. {do}")
     retrieval = dict(sections.get("retrieve", {}))
     k = retrieval.pop("topk", None)
     if retrieval or not (k is None or (isinstance(k, int) and k > 0)):
@@ -392,10 +385,8 @@ def with_changes(scene_map: Map, changes: Mapping[str, Any]) -> Map:
     except ManifestError as error:
         raise ManifestError(re.sub(r"^\w+:\s+", "localize: ", str(error))) from None
     if fixed := [name for name in FIXED_BY_MAP if getattr(settings, name) != getattr(before, name)]:
-        raise ManifestError(
-            f"localize.{fixed[0]}: cannot change for one query, as the whole map depends on it. "
-            f"To change it: {COMMAND} run MANIFEST --set localize.{fixed[0]}=..."
-        )
+        do = f"To change it: {COMMAND} run MANIFEST --set localize.{fixed[0]}=..."
+        raise ManifestError(f"localize.{fixed[0]}: cannot change for one query, as the whole map depends on it. {do}")
     other = copy.copy(scene_map)
     other.settings, other.original = settings, scene_map._first
     for name in ("localizer", "fallback", "index_of", "in_lengths", "points", "_world_from_cams"):
@@ -472,10 +463,9 @@ def show_matches(scene_map: Map, matches: QueryMatches, rank: int, image: int) -
 
     found = matches.references[image].images.tolist() if 0 <= image < len(matches.references) else list[int]()
     if not isinstance(matches, PnpMatches) or not 0 < rank <= len(found) or image not in matches.usable:
-        raise ArtifactError(
-            f"image {image}, reference {rank}: found no matches. Expected an image with features from 0 to "
-            f"{len(matches.references) - 1}, a reference from 1 to {len(found)}, and a method that matches keypoints."
-        )
+        known = f"an image with features from 0 to {len(matches.references) - 1}, a reference from 1 to {len(found)}"
+        expected = f"{known}, and a method that matches keypoints"
+        raise ArtifactError.at(f"image {image}, reference {rank}", "no matches", expected)
     at, index, matcher = matches.usable.index(image), found[rank - 1], matches.localizer.matcher
     alone = [References.of([index] if number == at else []) for number in range(len(matches.usable))]
     of_pair = matches.with_references(alone)

@@ -86,10 +86,9 @@ class StoredQueries:
         folder, session = scene_map.features_dir, self.session.id
         paths = [features_path(folder, session, kind.extractor.settings) for kind in scene_map.kinds]
         if missing := [path for path in paths if not path.exists()]:
-            raise ArtifactError(
-                f"{missing[0]}: no features of the queries. A run with the method `feed_forward` extracts none. To "
-                f"change its method: {COMMAND} run MANIFEST --set localize.method=hybrid"
-            )
+            do = f"To change its method: {COMMAND} run MANIFEST --set localize.method=hybrid"
+            fault = "no features of the queries. A run with the method `feed_forward` extracts none"
+            raise ArtifactError(f"{missing[0]}: {fault}. {do}")
         self.stores = [FeatureStore.open(path) for path in paths]
 
     def query(self, scene_map: Map, rows: Ints) -> QueryInput:
@@ -150,11 +149,9 @@ class InspectedPair:
         pairs = {pair_devices(path.stem): path for path in sorted(Path(poses_dir).glob("*_map_*_query_*.h5"))}
         if (map_device, query_device) not in pairs:
             known = [f"{query} in {mapped}" for mapped, query in pairs]
-            raise ArtifactError(
-                f"{poses_dir}: no correspondences of queries of {query_device!r} in the map of {map_device!r}, "
-                f"`<pair>.h5`. {nearest(f'{query_device} in {map_device}', known)} Localize first: "
-                f"{COMMAND} run MANIFEST."
-            )
+            fault = f"no correspondences of queries of {query_device!r} in the map of {map_device!r}, `<pair>.h5`"
+            do = f"{nearest(f'{query_device} in {map_device}', known)} Localize first: {COMMAND} run MANIFEST."
+            raise ArtifactError(f"{poses_dir}: {fault}. {do}")
         self.map_device, self.label = map_device, f"{query_device} in the map of {map_device}"
         self._h5 = pairs[map_device, query_device]
         files = self._files = SceneFiles(self._h5.parents[2], self._h5.parents[1].name)

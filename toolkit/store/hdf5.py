@@ -31,9 +31,7 @@ MAX_TEXTS = 1 << 12
 def write_groups(
     path: Path, groups: Iterable[tuple[str, Mapping[str, NDArray[Any]]]], attributes: Mapping[str, Any]
 ) -> None:
-    """Write a file of groups, each given by its name and arrays of numbers or texts, with `attributes`; it replaces
-    one.
-    """
+    """Write, or replace, a file of groups, by name and arrays of numbers or texts, with `attributes`."""
     text = h5py.string_dtype()
     with write_atomic(path) as temporary, h5py.File(temporary, "w", libver="latest") as file:
         file.attrs.update(attributes)

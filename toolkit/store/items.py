@@ -120,9 +120,7 @@ class Items(Mapping[str, dict[str, NDArray[Any]]]):
             return {}
 
     def __getitem__(self, name: str) -> dict[str, NDArray[Any]]:
-        """Return the arrays of an item; raise KeyError if there is none, DamagedError if its content is not what was
-        written.
-        """
+        """Return the arrays of an item; raise KeyError if there is none, DamagedError if it has changed."""
         entry = self._entries[name]
         if not entry.shard.exists():  # another process has put it into a later one
             self.refresh()

@@ -262,9 +262,7 @@ def _cells(height: float, width: float, colors: Any, stagger: str, **options: An
 
 
 def build_room(seed: int, index: int, look: int | None = None) -> Scene:
-    """Return the geometry and materials of a room, at the position of its index, with its own look or that of another
-    index; `paint` makes its textures.
-    """
+    """Return the geometry and materials of a room at the place of its index, with its own look or another's."""
     look = index if look is None else look
     rng = named_rng(seed, look, "room")
     kind = list(KINDS.values())[(look + seed) % len(KINDS)]

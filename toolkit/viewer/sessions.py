@@ -212,9 +212,8 @@ def _frames_of(
     Tracks are world positions (n, 3) of each device, by subsession; of all frames, also those that thinning drops.
     """
     if subsession not in ("all", *session.subsessions):
-        raise CaptureError(
-            f"Session {session.id} has no subsession {subsession!r}; known: {', '.join(session.subsessions)}, all."
-        )
+        known = ", ".join(session.subsessions)
+        raise CaptureError(f"Session {session.id} has no subsession {subsession!r}; known: {known}, all.")
     table, key = _slots(session), ["timestamp", "device_id"]
     if subsession != "all":
         table = table[table["subsession"] == subsession]
@@ -484,18 +483,14 @@ class _QueryPoses:
         poses, prefix, lines = Trajectory.read(path), f"{capture.name}_map_", list[Floats]()
         mapped, queried = pair_devices(path.stem) if path.stem.startswith(prefix) else ("", "")
         if mapped and session.device != (mapped if session.split == "map" else queried):
-            raise ArtifactError(
-                f"{path.name} holds {queried} queries in the {mapped} map, which has nothing to do with "
-                f"session {session.id}. Expected a file for that device."
-            )
+            found = f"{queried} queries in the {mapped} map, which has nothing to do with session {session.id}"
+            raise ArtifactError(f"{path.name} holds {found}. Expected a file for that device.")
         h5 = path.with_name(f"{path.stem.removesuffix('_sequence')}.h5")
         if with_references:
             if not mapped:
-                raise ArtifactError(
-                    f"{path}: the references of its queries are in the h5 file of a pair, {prefix}<M>_query_<Q>.h5, "
-                    "but this file is not named after a pair. Give the poses of a pair, or leave out "
-                    "vis_retrieve_queries."
-                )
+                fault = f"this file is not named after a pair, {prefix}<M>_query_<Q>, whose h5 file has the references"
+                do = "Give the poses of a pair, or leave out vis_retrieve_queries."
+                raise ArtifactError(f"{path}: {fault}. {do}")
             results, map_session = PairResults.open(h5), capture[f"{mapped}_map"]
             center_of = dict(zip(map_session.image_names, map_session.world_from_cam()[:, :3, 3], strict=True))
             # The poses may be those of the sequence stage.
