@@ -207,7 +207,7 @@ class _Stage(Remade):
         self.folders, self.queries = folders, queries
         self.skip_existing, self.workers = skip_existing, workers or default_workers()
         self.capture = Capture.from_sessions_root(folders.sessions)
-        self.settings = settings = LocalizeSettings.of(settings, {"unit": self.capture.unit_of(settings.unit)})
+        self.settings = settings = settings.model_copy(update={"unit": self.capture.unit_of(settings.unit)})
         """With the capture's unit instead of `auto`."""
         self.kinds, self.escalation = create_methods(settings)
         self.predictor = open_predictor(settings, self.capture, folders.map) if settings.predicts else None
@@ -559,7 +559,7 @@ def explain_query(
     sessions_root: str | Path, retrieval_dir: str | Path, features_dir: str | Path, map_dir: str | Path,
     map_device: str, query_device: str, settings: LocalizeSettings, queries: str = "keyframes_pruned_subsampled",
     index: int = 0,
-) -> tuple[FeedForwardLocalizer, Query, FeedForwardAnswer]:
+) -> tuple[FeedForwardLocalizer, Query, FeedForwardAnswer]:  # fmt: skip
     """Run the predictor on one query of a pair again, by its index in the keyframe list, with what `localize_pairs` was
     given. Return the localizer, the query, and the localizer's full output for it, as `draw_prediction` takes it.
 
@@ -569,7 +569,7 @@ def explain_query(
     """
     if not settings.predicts:
         raise ToolkitError(f"The method {settings.method} does not use a predictor. Use feed_forward or hybrid.")
-    settings = resolve_auto(LocalizeSettings.of(settings, {"method": "feed_forward"}))
+    settings = resolve_auto(settings.model_copy(update={"method": "feed_forward"}))
     folders = _Folders(*map(Path, (sessions_root, retrieval_dir, retrieval_dir, features_dir, map_dir)))
     stage = _Stage(folders, settings, queries, skip_existing=True, workers=1)
     pair = _Pair(stage, map_device, query_device).open()
