@@ -32,6 +32,7 @@ from toolkit.figures.style import (
 from toolkit.figures.top_view import Ground, Layer, draw_places
 from toolkit.files import older_files, pair_name, require_whole, why_older
 from toolkit.geometry import Floats
+from toolkit.pose.base import Status, statuses
 from toolkit.results.metrics import (
     REASONS,
     THRESHOLDS,
@@ -426,7 +427,7 @@ def draw_deviations(errors: pd.DataFrame, unit: str = "m") -> "Figure":
     """
     errors = errors[_has_deviation(errors)]
     stated, actual = (errors[name].to_numpy(float).clip(1e-5) for name in ("position_std_m", "translation_error_m"))
-    ok = (errors["status"] == "ok").to_numpy(bool)
+    ok = (statuses(errors["status"]) == Status.OK).to_numpy(bool)
     figure = new_figure(5.2, 4.6)
     axis = figure.subplots()
     low, high = min(stated.min(), actual.min()) / 1.5, max(stated.max(), actual.max()) * 1.5

@@ -117,6 +117,10 @@ class Status(StrEnum):
         status, _, reason = text.partition(": ")
         return cls(status), reason
 
+    def text(self, reason: str) -> str:
+        """Return status and reason as the text that `parse` reads."""
+        return f"{self}: {reason}" if reason else str(self)
+
     @property
     def rank(self) -> int:
         """2 for `ok`, 1 for `low_confidence`, 0 without a pose."""
@@ -298,7 +302,7 @@ class QueryResult:
     @property
     def status_text(self) -> str:
         """Status and reason, column `status` of the table: `failed: too few matches`."""
-        return f"{self.status}: {self.reason}" if self.reason else str(self.status)
+        return self.status.text(self.reason)
 
     @property
     def position_std(self) -> float:
