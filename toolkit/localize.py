@@ -436,10 +436,10 @@ class _Pair:
     def _stored(self, items: Items, todo: _Todo) -> tuple[QueryResult, QueryResult]:
         """Return the stored results of a query: from the features that every query has, and the latest of a retry."""
         name = todo[0].removesuffix(_FEW).removesuffix(_RETRIED)
-        first = QueryResult.from_arrays(items[name]).with_row(items.note(name))
+        first = QueryResult.from_row(items.note(name), items[name])
         if not items.is_current(name + _FEW, todo[1]):
             return first, first
-        return first, QueryResult.from_arrays(items[name + _FEW] or items[name]).with_row(items.note(name + _FEW))
+        return first, QueryResult.from_row(items.note(name + _FEW), items[name + _FEW] or items[name])
 
     def _is_open(self, items: Items, todo: _Todo) -> bool:
         """Tell whether a query should be retried with few references, or with all; see `Map.rounds`."""

@@ -106,7 +106,7 @@ def test_a_result_comes_back_from_its_row_and_arrays(posed: bool) -> None:
         written = replace(first, status=Status.FAILED, reason="too few inliers (3: within)", remark="torn.jpg")
     row = json.loads(json.dumps(written.to_row(5, "phone")))
     assert row["status"] == ("ok" if posed else "failed: too few inliers (3: within)")
-    read = QueryResult.from_arrays(written.arrays()).with_row(row)
+    read = QueryResult.from_row(row, written.arrays())
     assert (read.world_from_rig is not None) == (read.covariance is not None) == read.misfit == posed
     for name in ("status", "reason", "remark", "num_inliers", "num_matches", "p_correct", "rmse_px", "seconds"):
         assert getattr(read, name) == getattr(written, name), name

@@ -161,21 +161,18 @@ class PairResults:
         Raises:
             ArtifactError: its correspondences are damaged (DamagedError) or cannot be read.
         """
-        row: dict[str, Any] = self.table.iloc[number].to_dict()
         pose, covariance = self.poses[number], self.covariances[number]
         return replace(
-            self.stored(int(row["timestamp"]), str(row["device_id"])).with_row(row),
+            self.stored(self.table.iloc[number].to_dict()),
             world_from_rig=pose if is_posed(pose) else None,
             covariance=None if np.isnan(covariance).all() else covariance,
         )
 
-    def stored(self, timestamp: int, device_id: str) -> QueryResult:
-        """Return the arrays of a query; empty if the stage could not process it."""
-        name = query_group(timestamp, device_id)
-        if not has_group(self._file, name):
-            return QueryResult(Status.FAILED)
+    def stored(self, row: Mapping[str, Any]) -> QueryResult:
+        """Return the result of the query of a row, with its arrays if the stage could process it."""
+        name = query_group(int(row["timestamp"]), str(row["device_id"]))
         try:
-            return QueryResult.from_arrays(read_group(self._file, name))
+            return QueryResult.from_row(row, read_group(self._file, name) if has_group(self._file, name) else None)
         except (*HDF5_ERRORS, AttributeError) as error:
             raise DamagedError(
                 self.h5, f"{self.h5}: {name} is not as a run writes it ({first_line(error)}). Localize again."
