@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
-from toolkit.capture.tables import POSES_UNIT, in_unit_of_poses, read_query_table
+from toolkit.capture.tables import POSES_UNIT, in_unit_of_poses
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import ToolkitError, reason_of
 from toolkit.features.features import MutualMatcher
@@ -49,6 +49,7 @@ from toolkit.prediction.network import open_predictor
 from toolkit.results.metrics import camera_messages
 from toolkit.results.pair import (
     MAPS,
+    PairResults,
     attributes,
     pose_sources,
     query_group,
@@ -139,7 +140,7 @@ def localize_pairs(
             with table.row(*devices) as row:
                 table.check_upstream()
                 skipped = pair.update()
-                rows = read_query_table(pair.file("csv"), ["status"])
+                rows = PairResults.open(pair.file("csv"), whole=False).table
                 query_tables.setdefault(devices[1], []).append(rows)
                 of_map = read_map_record(pair.map_record)
                 row |= {

@@ -47,6 +47,7 @@ from toolkit.results.metrics import (
     threshold_name,
     threshold_text,
 )
+from toolkit.results.pair import PairResults
 from toolkit.runs.pairs import LEFT_OUT
 
 if TYPE_CHECKING:
@@ -93,9 +94,9 @@ class SequencePair:
         return self.stem.with_name(f"{self.stem.name}_sequence.txt")
 
     def _whole(self, end: str) -> Path:
-        """Return a file of the pair; raise ArtifactError if it is damaged."""
+        """Return a file of the stage; raise ArtifactError if it is damaged."""
         path = self.stem.with_name(self.stem.name + end)
-        require_whole(path, of=None if end == ".txt" else self.path)
+        require_whole(path, of=self.path)
         return path
 
     @cached_property
@@ -106,7 +107,7 @@ class SequencePair:
     @cached_property
     def steps(self) -> dict[str, Trajectory]:
         """Query poses after each step: `single`, the steps that the stage wrote, and `sequence`."""
-        steps = {SINGLE: Trajectory.read(self._whole(".txt"))}
+        steps = {SINGLE: PairResults.open(f"{self.stem}.txt").trajectory}
         if (path := self._whole("_sequence_steps.csv")).is_file():
             for name, rows in read_query_table(path, ["step", *POSE_NAMES]).groupby("step", sort=False):
                 qt = rows[list(POSE_NAMES)].to_numpy(float)

@@ -304,14 +304,14 @@ def _read_table(path: Path, messages: list[str]) -> pd.DataFrame:
 def _read_statuses(files: SceneFiles, messages: list[str]) -> pd.DataFrame:
     """Return `STATUS_COLUMNS` of every query of every pair, with or without ground truth."""
     tables = [pd.DataFrame()]
-    for path in pairs_of(files.poses_dir):
+    for devices, path in pairs_of(files.poses_dir).items():
         try:
-            results = PairResults.open(path)
+            table = PairResults.open(path).table
         except ArtifactError:
             messages.append(f"{path.name} cannot be read")
             continue
-        devices = dict(zip(("map_device", "query_device"), results.devices, strict=True))
-        tables.append(results.table.rename(columns=POSES_UNIT).reindex(columns=STATUS_COLUMNS).assign(**devices))
+        of_pair = dict(zip(review.PAIR, devices, strict=True))
+        tables.append(table.rename(columns=POSES_UNIT).reindex(columns=STATUS_COLUMNS).assign(**of_pair))
     return pd.concat(tables, ignore_index=True)
 
 
