@@ -443,25 +443,19 @@ class _Pair:
         return first, QueryResult.from_row(items.note(name + _FEW), items[name + _FEW] or items[name])
 
     def _is_open(self, items: Items, todo: _Todo) -> bool:
-        """Tell whether a query should be retried with few references, or with all; see `Map.rounds`."""
-        first, latest = self._stored(items, todo)
-        if not self.map.is_unsure(first):
-            return False
-        query, references = self.query(todo[2])
-        if not self.map.needs_fallback(query, references, first):
-            return False
-        few = todo[0].endswith(_FEW)
-        return len(self.map.rounds(references, first)) > 1 if few else not self.map.is_settled(first, latest)
+        """Tell whether a query should be retried in the round of its item."""
+        first = self._stored(items, todo)[0]
+        unsure = self.map.is_unsure(first) and self.map.needs_fallback(*self.query(todo[2]), first)
+        return unsure and bool(self._asked(items, todo))
 
-    def _asked(self, todo: _Todo, first: QueryResult) -> Sequence[References]:
-        """Return the references that a query asks in the round of its item, given its first result."""
+    def _asked(self, items: Items, todo: _Todo) -> Sequence[References]:
+        """Return the references that a query asks in the round of its item, see `Map.references_of_retry`."""
         references = self.stored.references_of(self.map, self.rows[todo[2]])
-        return self.map.rounds(references, first)[0 if todo[0].endswith(_FEW) else -1]
+        return self.map.references_of_retry(todo[0].endswith(_FEW), references, *self._stored(items, todo))
 
     def add_fallback(self, items: Items, todo: Sequence[_Todo]) -> None:
         """Extract and match the fallback features of queries."""
-        asked = {one[2]: self._asked(one, self._stored(items, one)[0]) for one in todo}
-        self._add_features(self.map.escalation, asked)
+        self._add_features(self.map.escalation, {one[2]: self._asked(items, one) for one in todo})
 
     def localize_into(
         self, items: Items, todo: Sequence[_Todo], retry_s: float | None = None
@@ -477,8 +471,8 @@ class _Pair:
 
         def retried() -> Iterator[_Task]:
             for one in todo:
-                first, earlier[one[2]] = self._stored(items, one)
-                yield one[2], (self.query(one[2])[0], self._asked(one, first)), earlier[one[2]], retry_s or 0.0
+                latest = earlier[one[2]] = self._stored(items, one)[1]
+                yield one[2], (self.query(one[2])[0], self._asked(items, one)), latest, retry_s or 0.0
 
         if retry_s is None:
             results = self._run(self._locate, self._predicted(list(of_number)), len(todo))
