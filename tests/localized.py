@@ -28,7 +28,8 @@ def stored(
 
 def read_queries(path: Path) -> Callable[[int, str], QueryResult]:
     """Return a function that reads what the file of correspondences holds of a query, by timestamp and device id."""
-    return PairResults(path, pd.DataFrame()).stored
+    stored = PairResults(path, pd.DataFrame()).stored
+    return lambda timestamp, device_id: stored({"timestamp": timestamp, "device_id": device_id, "status": "failed"})
 
 
 def write_queries(path: Path, queries: Mapping[tuple[int, str], QueryResult], maps: Sequence[str] = ()) -> None:

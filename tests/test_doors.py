@@ -18,6 +18,7 @@ from toolkit import notebook, pipeline
 from toolkit.capture import Capture
 from toolkit.capture.session import IMPORT_RECORD
 from toolkit.files import SceneFiles, map_record_path, read_map_record
+from toolkit.geometry import qt_from_pose
 from toolkit.localize import localize_image
 from toolkit.models import da3
 from toolkit.notebook import notebook_path
@@ -140,6 +141,7 @@ def test_every_door_gives_the_same_poses(
         path = files.poses_txt(map_device, query_device)
         record = map_record_path(files.poses_dir, files.scene, map_device)
         results, unit = PairResults.open(path), read_map_record(record)["unit"]
+        written = results.trajectory
         assert len(results) == 2
         assert unit is None
         # by hand
@@ -167,8 +169,12 @@ def test_every_door_gives_the_same_poses(
             shown = inspected.look(number)
             assert shown.result.status_text == found.status_text == one.status_text
             assert shown.unit == results.unit
-            for other in (found, shown.result, shown.result.what_if().after.result):
-                if one.world_from_rig is None:
-                    assert other.world_from_rig is None
-                else:
-                    np.testing.assert_allclose(other.world_from_rig, one.world_from_rig, atol=1e-9)
+            again = shown.result.what_if().after.result
+            if one.world_from_rig is None:
+                assert found.world_from_rig is shown.result.world_from_rig is again.world_from_rig is None
+                continue
+            np.testing.assert_array_equal(shown.result.world_from_rig, one.world_from_rig)
+            timestamp, device_id = results.table.loc[number, ["timestamp", "device_id"]]
+            (in_file,) = written.qt[(written.timestamps == timestamp) & (written.device_ids == device_id)]
+            for other in (found, again):  # as a file has it, to the last digit
+                np.testing.assert_array_equal(qt_from_pose(other.world_from_rig), in_file)

@@ -9,6 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from tests.unattended import no_kernels
 from toolkit import notebook, pipeline
 from toolkit.__main__ import app
 from toolkit.errors import ArtifactError, ManifestError, StageError
-from toolkit.manifest import OPTIONAL, STAGES, Manifest, RerankSettings, RetrieveSettings
+from toolkit.manifest import OPTIONAL, STAGES, Manifest, RerankSettings, RetrieveSettings, Settings
 from toolkit.notebook import StatusLine, notebook_parameters, notebook_path
 from toolkit.runs.folder import LOG_VARIABLE, swept_runs
 
@@ -54,9 +55,7 @@ def test_notebooks_are_committed_clean(stage: str) -> None:
     nbformat.validate(content)
     assert content.metadata.kernelspec.name == "python3"
     code = [cell for cell in content.cells if cell.cell_type == "code"]
-    assert not any(cell.outputs or cell.execution_count for cell in code), (
-        "clear the outputs before committing"
-    )
+    assert not any(cell.outputs or cell.execution_count for cell in code), "clear the outputs before committing"
     assert content.cells[0].source.startswith("# ")
     assert content.cells[1].metadata.tags == ["parameters"]
     assert content.cells[2].metadata.tags == ["setup"]
@@ -169,6 +168,35 @@ def test_the_notebook_localizes_by_hand_as_the_run_did(small_capture: Path, tmp_
     poses = "SMALL/poses/SMALL_map_ios_query_hl.txt"
     assert (tmp_path / "near-by-hand" / poses).read_bytes() == (tmp_path / "near" / poses).read_bytes()
     assert re.search(r"method +nearest +run", (tmp_path / "04.ipynb").read_text())
+
+
+def test_a_run_validates_the_settings_of_a_stage_twice(
+    small_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """When the manifest is loaded, and in the notebook of the stage; those of localize were five times. What is read
+    back from results is not counted."""
+    pytest.importorskip("gtsam")
+    given: dict[str, dict[str, Any]] = {
+        "explore": {"samples": 1}, "embed": {"batch_size": 2}, "retrieve": {"index": "Flat"}, "rerank": {"topn": 12},
+        "localize": {"method": "nearest"}, "sequence": {"relocalize": False}, "evaluate": {"thresholds": [[1, 0.1]]},
+        "visualize": {"samples": 1, "recordings": False, "session_recordings": False},
+    }  # fmt: skip
+    assert set(given) == set(STAGES)
+    content = {"captures": [str(small_capture)], "output_root": ".", "pairs": [["ios", "hl"]]} | given
+    (tmp_path / "counted.yaml").write_text(json.dumps(content))
+    counts, validate = Counter[str](), Settings.model_validate.__func__  # type: ignore[attr-defined]
+
+    def counted(model: type[Settings], raw: Any) -> Settings:
+        if sys._getframe(2).f_globals["__name__"] != "toolkit.results.pair":
+            counts.update(given.keys() & raw.keys() if model is Manifest else [model.__name__])
+        settings: Settings = validate(model, raw)
+        return settings
+
+    monkeypatch.setattr(Settings, "model_validate", classmethod(counted))
+    with no_kernels():
+        pipeline.run(tmp_path / "counted.yaml", say=lambda *a, **k: None)
+    models = {stage: type(Manifest.defaults(stage)).__name__ for stage in STAGES}
+    assert {stage: (counts[stage], counts[models[stage]]) for stage in STAGES} == dict.fromkeys(STAGES, (1, 1))
 
 
 @pytest.mark.parametrize("stage", STAGES)

@@ -20,7 +20,7 @@ from toolkit.embed import embed_sessions
 from toolkit.errors import ManifestError
 from toolkit.files import SceneFiles, map_record_path, pair_name
 from toolkit.localize import localize_pairs
-from toolkit.pose.base import QueryResult
+from toolkit.pose.base import QueryResult, Status
 from toolkit.retrieve import retrieve_pairs
 from toolkit.sequence import COLUMNS, sequence_pairs
 from toolkit.sequences.pose_graph import FAR
@@ -308,7 +308,8 @@ class Alike:
         assert truth is not None
         frames = pd.read_csv(str(done["path"]).replace(".txt", ".csv"), keep_default_na=False)
         frames = frames[frames["recording"] != ""]
-        frames["status"] = frames["status"].replace(FAR, "ok")  # in the right room, but not where in it
+        # in the right room, but not where in it
+        frames["status"] = frames["status"].replace(Status.LOW_CONFIDENCE.text(FAR), "ok")
         keys = frames["timestamp"], frames["device_id"]
         poses = Trajectory.read(done["path"]).lookup(*keys)
         frames["deg"], frames["m"] = geometry.pose_error(poses, truth.lookup(*keys))

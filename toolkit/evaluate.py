@@ -303,7 +303,7 @@ def _read_results(path: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
         return None, "no poses file"
     try:
         require_whole(path)
-        poses = metrics.poses_of(Trajectory.read(path), keys)
+        poses = PairResults(path, keys).poses
     except ArtifactError as error:
         return None, str(error)
     except CaptureError as error:

@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.images import default_workers, prefetch
-from toolkit.capture.tables import POSES_UNIT, in_unit_of_poses, read_query_table
+from toolkit.capture.tables import POSES_UNIT, in_unit_of_poses
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.errors import ToolkitError, reason_of
 from toolkit.features.features import MutualMatcher
@@ -49,6 +49,7 @@ from toolkit.prediction.network import open_predictor
 from toolkit.results.metrics import camera_messages
 from toolkit.results.pair import (
     MAPS,
+    PairResults,
     attributes,
     pose_sources,
     query_group,
@@ -139,7 +140,7 @@ def localize_pairs(
             with table.row(*devices) as row:
                 table.check_upstream()
                 skipped = pair.update()
-                rows = read_query_table(pair.file("csv"), ["status"])
+                rows = PairResults.open(pair.file("csv"), whole=False).table
                 query_tables.setdefault(devices[1], []).append(rows)
                 of_map = read_map_record(pair.map_record)
                 row |= {
@@ -205,7 +206,7 @@ class _Stage(Remade):
         self.folders, self.queries = folders, queries
         self.skip_existing, self.workers = skip_existing, workers or default_workers()
         self.capture = Capture.from_sessions_root(folders.sessions)
-        self.settings = settings = LocalizeSettings.of(settings, {"unit": self.capture.unit_of(settings.unit)})
+        self.settings = settings = settings.model_copy(update={"unit": self.capture.unit_of(settings.unit)})
         """With the capture's unit instead of `auto`."""
         self.kinds, self.escalation = create_methods(settings)
         self.predictor = open_predictor(settings, self.capture, folders.map) if settings.predicts else None
@@ -434,31 +435,25 @@ class _Pair:
     def _stored(self, items: Items, todo: _Todo) -> tuple[QueryResult, QueryResult]:
         """Return the stored results of a query: from the features that every query has, and the latest of a retry."""
         name = todo[0].removesuffix(_FEW).removesuffix(_RETRIED)
-        first = QueryResult.from_arrays(items[name]).with_row(items.note(name))
+        first = QueryResult.from_row(items.note(name), items[name])
         if not items.is_current(name + _FEW, todo[1]):
             return first, first
-        return first, QueryResult.from_arrays(items[name + _FEW] or items[name]).with_row(items.note(name + _FEW))
+        return first, QueryResult.from_row(items.note(name + _FEW), items[name + _FEW] or items[name])
 
     def _is_open(self, items: Items, todo: _Todo) -> bool:
-        """Tell whether a query should be retried with few references, or with all; see `Map.rounds`."""
-        first, latest = self._stored(items, todo)
-        if not self.map.is_unsure(first):
-            return False
-        query, references = self.query(todo[2])
-        if not self.map.needs_fallback(query, references, first):
-            return False
-        few = todo[0].endswith(_FEW)
-        return len(self.map.rounds(references, first)) > 1 if few else not self.map.is_settled(first, latest)
+        """Tell whether a query should be retried in the round of its item."""
+        first = self._stored(items, todo)[0]
+        unsure = self.map.is_unsure(first) and self.map.needs_fallback(*self.query(todo[2]), first)
+        return unsure and bool(self._asked(items, todo))
 
-    def _asked(self, todo: _Todo, first: QueryResult) -> Sequence[References]:
-        """Return the references that a query asks in the round of its item, given its first result."""
+    def _asked(self, items: Items, todo: _Todo) -> Sequence[References]:
+        """Return the references that a query asks in the round of its item, see `Map.references_of_retry`."""
         references = self.stored.references_of(self.map, self.rows[todo[2]])
-        return self.map.rounds(references, first)[0 if todo[0].endswith(_FEW) else -1]
+        return self.map.references_of_retry(todo[0].endswith(_FEW), references, *self._stored(items, todo))
 
     def add_fallback(self, items: Items, todo: Sequence[_Todo]) -> None:
         """Extract and match the fallback features of queries."""
-        asked = {one[2]: self._asked(one, self._stored(items, one)[0]) for one in todo}
-        self._add_features(self.map.escalation, asked)
+        self._add_features(self.map.escalation, {one[2]: self._asked(items, one) for one in todo})
 
     def localize_into(
         self, items: Items, todo: Sequence[_Todo], retry_s: float | None = None
@@ -474,8 +469,8 @@ class _Pair:
 
         def retried() -> Iterator[_Task]:
             for one in todo:
-                first, earlier[one[2]] = self._stored(items, one)
-                yield one[2], (self.query(one[2])[0], self._asked(one, first)), earlier[one[2]], retry_s or 0.0
+                latest = earlier[one[2]] = self._stored(items, one)[1]
+                yield one[2], (self.query(one[2])[0], self._asked(items, one)), latest, retry_s or 0.0
 
         if retry_s is None:
             results = self._run(self._locate, self._predicted(list(of_number)), len(todo))
@@ -568,7 +563,7 @@ def explain_query(
     settings: LocalizeSettings,
     queries: str = "keyframes_pruned_subsampled",
     index: int = 0,
-) -> tuple[FeedForwardLocalizer, Query, FeedForwardAnswer]:
+) -> tuple[FeedForwardLocalizer, Query, FeedForwardAnswer]:  # fmt: skip
     """Run the predictor on one query of a pair again, by its index in the keyframe list, with what `localize_pairs` was
     given. Return the localizer, the query, and the localizer's full output for it, as `draw_prediction` takes it.
 
@@ -578,7 +573,7 @@ def explain_query(
     """
     if not settings.predicts:
         raise ToolkitError(f"The method {settings.method} does not use a predictor. Use feed_forward or hybrid.")
-    settings = resolve_auto(LocalizeSettings.of(settings, {"method": "feed_forward"}))
+    settings = resolve_auto(settings.model_copy(update={"method": "feed_forward"}))
     folders = _Folders(*map(Path, (sessions_root, retrieval_dir, retrieval_dir, features_dir, map_dir)))
     stage = _Stage(folders, settings, queries, skip_existing=True, workers=1)
     pair = _Pair(stage, map_device, query_device).open()

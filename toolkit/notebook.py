@@ -100,6 +100,7 @@ class Folders(SimpleNamespace):
     def __init__(self, stage: str, manifest: Manifest, finished: Path | None = None, **folders: Path | None) -> None:
         super().__init__(**folders)
         self._stage, self._manifest, self._finished = stage, manifest, finished
+        self._checked: tuple[str, Settings | None] = "", None
 
     @property
     def finished_run(self) -> "Run | None":
@@ -112,10 +113,11 @@ class Folders(SimpleNamespace):
 
     @property
     def settings(self) -> Any:
-        """The settings model of the stage."""
-        section = self._manifest.stage(self._stage)
-        check_values(self._stage, _user_names(), section)
-        return stage_settings(self._stage, _user_names(), section)
+        """The settings model of the stage, validated again only if a parameter has changed."""
+        values, known = _user_names(), notebook_parameters(notebook_path(self._stage))
+        if (given := repr({name: values.get(name) for name in known})) != self._checked[0]:
+            self._checked = given, check_values(self._stage, values, self._manifest.stage(self._stage))
+        return self._checked[1]
 
     @property
     def thresholds(self) -> Any:
@@ -246,7 +248,8 @@ def start(stage: str, sessions_root: str | None = None, run: str | None = None, 
     files = SceneFiles(by_hand or project_root() / "runs" / f"{scene}-by-hand", scene)
     source = None if run_log else taken_from or _finished_run(files.run.parent, scene)
     manifest = _manifest_of(source, sessions)
-    check_values(stage, _user_names(), manifest.stage(stage))
+    found = Folders(stage, manifest, source, sessions_root=sessions)
+    _ = found.settings  # checks the parameters
     _check_devices_and_queries(stage, sessions, manifest.queries)
     if run_log is None and None in folders.values():
         _take_from_run(stage, files, source)
@@ -257,14 +260,13 @@ def start(stage: str, sessions_root: str | None = None, run: str | None = None, 
     defaults = files.folders(stage, reranked)
     made = {defaults.get(name) for name, folder in folders.items() if folder is None}
     _make_upstream(stage, sessions, files, made, source)
-    resolved: dict[str, Path | None] = {"sessions_root": sessions}
     for name, folder in folders.items():
         given = Path(folder).expanduser().resolve() if folder else None
-        resolved[name] = given or defaults.get(name)
+        setattr(found, name, given or defaults.get(name))
         written = defaults.get(name) == files.of_stage(stage) or name in _FILLED.get(stage, ())
         if given and run_log is None and written:
             _require_outside_of_runs(name, given)
-    return Folders(stage, manifest, source, **resolved)
+    return found
 
 
 def find_run(run: str | Path) -> Path:
@@ -684,15 +686,15 @@ def check_names(settings: Settings) -> None:
         matchers_of(kinds or ["sift", "aliked"], settings.matcher.name)
 
 
-def check_values(name: str, values: Mapping[str, Any], of_run: Settings | None = None) -> None:
-    """Refuse, by a ManifestError that names the first one, parameters of the notebook `<number>_<name>.ipynb`, which
-    include a stage's settings, see `stage_settings`, of a wrong type or value; other names are ignored.
+def check_values(name: str, values: Mapping[str, Any], of_run: Settings | None = None) -> Settings | None:
+    """Return a stage's settings, see `stage_settings`. Refuse, by a ManifestError that names the first one, parameters
+    of the notebook `<number>_<name>.ipynb` of a wrong type or value, settings too; other names are ignored.
     """
-    path, given = notebook_path(name), dict[str, Any]()
+    path, given, settings = notebook_path(name), dict[str, Any](), of_run
     defaults, meanings = notebook_parameters(path), dict(re.findall(r"^(\w+) = .*  # (.+)", _listing(path), re.M))
-    if of_stage := _of_stage(name):
+    if (of_stage := _of_stage(name)) & values.keys():
         with suppress(ManifestError):  # together, as one that fits the others need not fit their defaults
-            stage_settings(name, values, of_run)
+            settings = stage_settings(name, values, of_run)
             values = {key: value for key, value in values.items() if key not in of_stage}
     for key in [key for key in defaults if key in values]:
         given[key] = values[key]
@@ -712,6 +714,7 @@ def check_values(name: str, values: Mapping[str, Any], of_run: Settings | None =
         raise ManifestError(f"photo: found {str(photo)!r}, which does not exist.")
     if name == "own_images":
         _check_own_images({key: value for key, value in given.items() if value != defaults[key]})
+    return settings
 
 
 def _of_parameter(key: str, text: str) -> ManifestError:

@@ -254,7 +254,7 @@ def run_name(
     user chose, else named after the overrides that change a result.
     """
     try:
-        plain = load_manifest(manifest_path)
+        plain = load_manifest(manifest_path) if overrides else manifest
     except ManifestError:  # it needs the overrides, so there is no run without them
         return manifest, name or manifest.name
     if any(override.partition("=")[0].strip() == "name" for override in overrides):

@@ -33,7 +33,7 @@ from toolkit.files import (
 )
 from toolkit.geometry import Floats, Ints, pose_error
 from toolkit.manifest import SequenceSettings
-from toolkit.pose.base import QueryResult, RoughPose, Status, status_counts, stds_of
+from toolkit.pose.base import QueryResult, RoughPose, Status, status_counts, statuses, stds_of
 from toolkit.results.pair import PairResults
 from toolkit.scene.frames import LocalizedFrames, SequenceLocalizer, localize_sequence
 from toolkit.scene.map import Map
@@ -214,24 +214,20 @@ class _SingleQueries:
         results = replace(results, table=rows)
         status = rows["status"].to_numpy(object)
         evidence = rows.reindex(columns=["p_correct", "rival_support"]).to_numpy(float)
-        ok = np.asarray(status == Status.OK)
+        ok = (statuses(rows["status"]) == Status.OK).to_numpy(bool)
         known = np.asarray(np.isfinite(results.covariances).all(axis=(1, 2)), bool)
         covariances = np.asarray(np.where(known[:, None, None], results.covariances, UNKNOWN_COVARIANCE))
         queries = PosedQueries(np.arange(len(rows)), results.poses, covariances, vote_weights(ok, *evidence.T), ok)
         return cls(rows[["timestamp", "device_id"]], status, queries)
 
     def posed(self, rows: Ints) -> PosedQueries:
-        """Return the queries with a pose among the frames of a piece; rows (N,) as `rows_of` returns them."""
+        """Return the queries with a pose among the frames of a piece; rows (N,) are the query of each, -1 for none."""
         frames = np.flatnonzero(rows >= 0)
         frames = frames[np.isfinite(self.results.world_from_rig[rows[frames]]).all(axis=(1, 2))]
         return replace(self.results.choose(rows[frames]), frames=frames)
 
-    def rows_of(self, timestamps: Ints, device_ids: Any) -> Ints:
-        """Return the index of each frame's query (N,), -1 for none."""
-        return self._index.find(timestamps, as_strings(device_ids))
-
     @cached_property
-    def _index(self) -> KeyIndex:
+    def index(self) -> KeyIndex:
         return KeyIndex(self.keys["timestamp"].to_numpy(), as_strings(self.keys["device_id"]))
 
 
@@ -300,7 +296,9 @@ def _frames(
         placed = done.placed
         steps += _step_rows(piece, done.steps)
         table = keys.reindex(columns=list(COLUMNS)).astype(object)
-        table["recording"], table["piece"], table["status"] = piece.recording, numbers[piece.recording], placed.status
+        verdicts = zip(placed.status, placed.reason, strict=True)
+        table["status"] = [status.text(reason) if status else "" for status, reason in verdicts]
+        table["recording"], table["piece"] = piece.recording, numbers[piece.recording]
         numbers[piece.recording] += 1
         table["single_status"] = np.append(singles.status, "")[piece.query]
         table.loc[list(done.relocalized), "again_status"] = [each.status_text for each in done.relocalized.values()]
@@ -384,5 +382,5 @@ def _pieces(session: Session, singles: _SingleQueries, settings: SequenceSetting
             between, interpolated = piece.at(times[own])
             piece, order = piece.joined(times[own[between]], interpolated)
             devices = np.append(devices, ids[own[between]])[order]
-            query = singles.rows_of(piece.timestamps, devices)
+            query = singles.index.find(piece.timestamps, as_strings(devices))
             yield _Piece(recording, devices, piece, query, singles.posed(query))

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 from tests.localized import read_queries, some_correspondences, stored, write_queries
+from toolkit.capture import Trajectory
 from toolkit.errors import ArtifactError
 from toolkit.geometry import make_pose
 from toolkit.pose.base import QueryResult, Rival, Status
@@ -108,7 +109,7 @@ def test_a_result_comes_back_from_its_row_and_arrays(posed: bool) -> None:
         written = replace(first, status=Status.FAILED, reason="too few inliers (3: within)", remark="torn.jpg")
     row = json.loads(json.dumps(written.to_row(5, "phone")))
     assert row["status"] == ("ok" if posed else "failed: too few inliers (3: within)")
-    read = QueryResult.from_arrays(written.arrays()).with_row(row)
+    read = QueryResult.from_row(row, written.arrays())
     assert (read.world_from_rig is not None) == (read.covariance is not None) == read.camera_contradicted == posed
     for name in ("status", "reason", "remark", "num_inliers", "num_matches", "p_correct", "rmse_px", "seconds"):
         assert getattr(read, name) == getattr(written, name), name
@@ -124,3 +125,21 @@ def test_a_result_comes_back_from_its_row_and_arrays(posed: bool) -> None:
 def test_status_and_reason_of_a_text(text: str, expected: tuple[str, str]) -> None:
     assert Status.parse(text) == expected
     assert [status.rank for status in Status] == [2, 1, 0]
+
+
+def test_a_query_is_found_by_number_key_and_image(tmp_path: Path) -> None:
+    path = tmp_path / "P_map_ios_query_hl.h5"
+    write_queries(path, QUERIES)
+    keys = list(QUERIES)
+    Trajectory.from_poses([keys[0][0]], [keys[0][1]], np.eye(4)[None]).write(path.with_suffix(".txt"))
+    listed = enumerate(QUERIES.items())
+    rows = [one.to_row(*key) | {"image": f"a/{number}.jpg;b/{number}.jpg"} for number, (key, one) in listed]
+    pd.DataFrame(rows).to_csv(path.with_suffix(".csv"), index=False)
+    results = PairResults.open(path)
+    for number, key in enumerate(keys):
+        found = [results[number], results[key], results[f"a/{number}.jpg"]]
+        assert [one.images for one in found] == [QUERIES[key].images] * 3
+        assert results[f"b/{number}.jpg"].references == QUERIES[key].references
+    for unknown in ((7, "nobody"), "c.jpg", len(keys)):
+        with pytest.raises(ArtifactError, match=r"no query|expected a number"):
+            results[unknown]

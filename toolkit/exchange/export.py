@@ -31,7 +31,7 @@ import PIL.Image
 import pycolmap
 from numpy.typing import NDArray
 
-from toolkit.capture import Session, Trajectory
+from toolkit.capture import Session
 from toolkit.capture.images import HEADER_ERRORS, camera_text
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import COMMAND, ArtifactError, CaptureError, DamagedError, ImageError, ManifestError, first_line
@@ -44,7 +44,6 @@ from toolkit.files import (
     files_fingerprint,
     image_name,
     own_name,
-    pair_name,
     read_references,
     read_sidecar,
     require_current,
@@ -53,7 +52,7 @@ from toolkit.files import (
     write_folder,
     write_text,
 )
-from toolkit.geometry import Floats, invert, pose_from_qt, qt_from_pose
+from toolkit.geometry import Floats, invert, qt_from_pose
 from toolkit.manifest import require_known
 from toolkit.mapping.local_map import LocalMap, map_path
 from toolkit.pose.base import Status, statuses
@@ -108,8 +107,8 @@ def export_colmap(
 
 def _maps_of(files: SceneFiles, device: str) -> list[Path]:
     """Return the files of the triangulated maps that a run localized with, one per kind of features."""
-    for path in sorted(files.poses_dir.glob(f"{pair_name(files.scene, device, '*')}.h5")):
-        if maps := [files.maps / name for name in names_of_maps(path)]:
+    for (map_device, _), path in pairs_of(files.poses_dir, ".h5").items():
+        if map_device == device and (maps := [files.maps / name for name in names_of_maps(path)]):
             require_current(path.with_suffix(".txt"), "localize", (".npz",))
             return maps
     raise ArtifactError(f"{files.poses_dir}: no query was localized in a triangulated map of {device}. {_LOCALIZE}")
@@ -251,11 +250,10 @@ def export_poses(
     contains a space.
     """
     require_known("names", names, NAMES)
-    path = _require_poses(SceneFiles(Path(run), scene).poses_txt(map_device, query_device))
-    session, poses = session_of_run(run, scene, f"{query_device}_query", capture), Trajectory.read(path)
-    lines = []
+    path, lines = _require_poses(SceneFiles(Path(run), scene).poses_txt(map_device, query_device)), []
+    session, poses = session_of_run(run, scene, f"{query_device}_query", capture), PairResults.open(path).trajectory
     keys = pd.DataFrame({"timestamp": poses.timestamps, "device_id": poses.device_ids})
-    for rows, world_from_rig in zip(session.rows_of_keyframes(keys), pose_from_qt(poses.qt), strict=True):
+    for rows, world_from_rig in zip(session.rows_of_keyframes(keys), poses.world_from_device, strict=True):
         for row, cam_from_world in zip(rows, invert(world_from_rig @ session.rig_from_cam(rows)), strict=True):
             numbers = (repr(float(value)) for value in qt_from_pose(cam_from_world))
             lines.append((_listed(session.image_name(row), names, path), *numbers))
@@ -469,10 +467,9 @@ def geo_table(run: str | Path, capture: str | Path | None = None) -> pd.DataFram
     scenes = localized_scenes(run)
     with open_captures([run], [] if capture is None else [capture], scenes) as capture_of:
         for scene in scenes:
-            for path in pairs_of(SceneFiles(run, scene).poses_dir):
+            for (map_device, query_device), path in pairs_of(SceneFiles(run, scene).poses_dir).items():
                 results = PairResults.open(path)
                 results.require_current()
-                map_device, query_device = results.devices
                 try:
                     origin = origin_of(capture_of(scene)[f"{map_device}_map"])
                 except CaptureError as error:

@@ -181,12 +181,11 @@ def _answers(
     files: SceneFiles, pair: tuple[str, ...], path: Path, keyframes: pd.DataFrame, failed: str
 ) -> tuple[Trajectory, pd.DataFrame, int]:
     """Return the poses to write for the keyframes, their origins, and the number of poses that nobody asked for."""
-    poses = _read_poses(path)
+    poses = _checked(PairResults(path, keyframes))
     rows = poses.index.find(keyframes["timestamp"].to_numpy(np.int64), keyframes["device_id"])
-    statuses, nearest, why_not = dict[Key, str](), dict[Key, Floats](), "not localized"
-    if path.with_suffix(".csv").is_file():
-        run_table = PairResults.open(path, whole=False).table
-        statuses = {(row.timestamp, row.device_id): row.status for row in run_table.itertuples()}
+    nearest, why_not = dict[Key, Floats](), "not localized"
+    run_table = PairResults.open(path, whole=False).table
+    statuses: dict[Key, str] = {(row.timestamp, row.device_id): row.status for row in run_table.itertuples()}
     if failed == "nearest" and np.any(rows < 0):
         require_current(files.poses_txt(*pair), "localize", (".jsonl", ".txt", RAW_DATA), missing=False)
         nearest, why_not = _nearest_references(files.retrieval(*pair))
@@ -209,16 +208,17 @@ def _answers(
     return written, table, len(poses) - int(np.sum(rows >= 0))
 
 
-def _read_poses(path: Path) -> Trajectory:
-    """Read a poses file. Raise ArtifactError for a duplicate key or a quaternion that is not of unit length."""
-    table = read_table(path, COLUMNS["trajectories.txt"])
-    poses = Trajectory.from_table(table)
-    repeated = np.flatnonzero(table.frame("timestamp", "device_id").duplicated())
+def _checked(results: PairResults) -> Trajectory:
+    """Return the poses. Raise ArtifactError for a duplicate key or a quaternion that is not of unit length."""
+    poses = results.trajectory
+    keys = pd.DataFrame({"timestamp": poses.timestamps, "device_id": poses.device_ids})
+    repeated = np.flatnonzero(keys.duplicated())
     wrong = np.flatnonzero(np.abs(np.linalg.norm(poses.qt[:, :4], axis=1) - 1) > UNIT_TOLERANCE)
     for rows, problem in ((repeated, "occurs twice"), (wrong, "has a quaternion that is not of length 1")):
         for row in rows[:1].tolist():
             key = f"(timestamp {poses.timestamps[row]}, device {poses.device_ids[row]!r})"
-            raise ArtifactError(f"{table.where(row)}: {key} {problem}. Localize this pair again, or correct the line.")
+            where = read_table(results.path, COLUMNS["trajectories.txt"]).where(row)
+            raise ArtifactError(f"{where}: {key} {problem}. Localize this pair again, or correct the line.")
     return poses
 
 

@@ -32,6 +32,7 @@ from toolkit.figures.style import (
 from toolkit.figures.top_view import Ground, Layer, draw_places
 from toolkit.files import older_files, pair_name, require_whole, why_older
 from toolkit.geometry import Floats
+from toolkit.pose.base import Status, statuses
 from toolkit.results.metrics import (
     REASONS,
     THRESHOLDS,
@@ -46,6 +47,7 @@ from toolkit.results.metrics import (
     threshold_name,
     threshold_text,
 )
+from toolkit.results.pair import PairResults
 from toolkit.runs.pairs import LEFT_OUT
 
 if TYPE_CHECKING:
@@ -92,9 +94,9 @@ class SequencePair:
         return self.stem.with_name(f"{self.stem.name}_sequence.txt")
 
     def _whole(self, end: str) -> Path:
-        """Return a file of the pair; raise ArtifactError if it is damaged."""
+        """Return a file of the stage; raise ArtifactError if it is damaged."""
         path = self.stem.with_name(self.stem.name + end)
-        require_whole(path, of=None if end == ".txt" else self.path)
+        require_whole(path, of=self.path)
         return path
 
     @cached_property
@@ -105,7 +107,7 @@ class SequencePair:
     @cached_property
     def steps(self) -> dict[str, Trajectory]:
         """Query poses after each step: `single`, the steps that the stage wrote, and `sequence`."""
-        steps = {SINGLE: Trajectory.read(self._whole(".txt"))}
+        steps = {SINGLE: PairResults.open(f"{self.stem}.txt").trajectory}
         if (path := self._whole("_sequence_steps.csv")).is_file():
             for name, rows in read_query_table(path, ["step", *POSE_NAMES]).groupby("step", sort=False):
                 qt = rows[list(POSE_NAMES)].to_numpy(float)
@@ -424,7 +426,7 @@ def draw_deviations(errors: pd.DataFrame, unit: str = "m") -> "Figure":
     """
     errors = errors[_has_deviation(errors)]
     stated, actual = (errors[name].to_numpy(float).clip(1e-5) for name in ("position_std_m", "translation_error_m"))
-    ok = (errors["status"] == "ok").to_numpy(bool)
+    ok = (statuses(errors["status"]) == Status.OK).to_numpy(bool)
     figure = new_figure(5.2, 4.6)
     axis = figure.subplots()
     low, high = min(stated.min(), actual.min()) / 1.5, max(stated.max(), actual.max()) * 1.5

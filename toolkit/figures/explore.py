@@ -18,7 +18,7 @@ from toolkit.figures.style import GREEN, ORANGE, VERMILLION, new_figure, plain_l
 from toolkit.figures.top_view import Ground, Layer, draw_places
 from toolkit.files import image_name, pair_devices, read_references
 from toolkit.geometry import Floats, qt_from_pose, unit
-from toolkit.pose.base import short_status, statuses
+from toolkit.pose.base import Status, short_status, statuses
 from toolkit.results.metrics import is_posed
 from toolkit.results.pair import PairResults
 from toolkit.sequences.odometry import Odometry, recordings_of
@@ -85,7 +85,7 @@ def list_unsure(paths: Iterable[str | Path]) -> pd.DataFrame:
     tables = []
     for results in map(PairResults.open, paths):
         (mapped, queried), table = results.devices, results.table
-        unsure = table[statuses(table["status"]) != "ok"].reindex(columns=["image", "status", "num_inliers"])
+        unsure = table[statuses(table["status"]) != Status.OK].reindex(columns=["image", "status", "num_inliers"])
         tables.append(unsure.assign(pair=f"{queried} in {mapped}"))
     columns = ["pair", "status", "num_inliers", "image"]
     return pd.concat(tables, ignore_index=True)[columns] if tables else pd.DataFrame(columns=columns)

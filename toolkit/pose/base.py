@@ -117,6 +117,10 @@ class Status(StrEnum):
         status, _, reason = text.partition(": ")
         return cls(status), reason
 
+    def text(self, reason: str) -> str:
+        """Return status and reason as the text that `parse` reads."""
+        return f"{self}: {reason}" if reason else str(self)
+
     @property
     def rank(self) -> int:
         """2 for `ok`, 1 for `low_confidence`, 0 without a pose."""
@@ -298,7 +302,7 @@ class QueryResult:
     @property
     def status_text(self) -> str:
         """Status and reason, column `status` of the table: `failed: too few matches`."""
-        return f"{self.status}: {self.reason}" if self.reason else str(self.status)
+        return self.status.text(self.reason)
 
     @property
     def position_std(self) -> float:
@@ -355,27 +359,30 @@ class QueryResult:
             "first_seconds": self.first_seconds,
         }
 
-    def with_row(self, row: Mapping[str, Any]) -> Self:
-        """Return the result that `to_row` made a row from; `self` has its pose, names and correspondences.
+    @classmethod
+    def from_row(cls, row: Mapping[str, Any], arrays: Mapping[str, Any] | None = None) -> Self:
+        """Return the result that `to_row` made a row from, which may lack columns or values, and `arrays` its arrays;
+        None: without a pose, names and correspondences.
 
-        The row may lack columns, or have missing values.
+        Raises:
+            ValueError, KeyError: an array has another shape or is missing.
         """
         known = {name: value for name, value in row.items() if not pd.isna(value)}
         status, reason = Status.parse(str(known["status"]))
-        kinds = {name: type(getattr(self, name)) for name in _NUMBERS if name not in _FROM_OTHERS}
-        return replace(
-            self,
-            status=status,
-            reason=reason,
+        kinds = {name: type(getattr(cls, name)) for name in _NUMBERS if name not in _FROM_OTHERS}
+        return cls(
+            status,
+            reason,
             found_by=str(known.get("method", "")),
             remark=str(known.get("reason", "")),
             first_status=known.get("first_status"),
             first_seconds=known.get("first_seconds"),
             **{name: kind(known[name]) for name, kind in kinds.items() if name in known},
+            **({} if arrays is None else _of_arrays(arrays)),
         )
 
     def arrays(self) -> dict[str, Any]:
-        """Return pose, correspondences, rivals and names as arrays by name; texts as objects; see `from_arrays`."""
+        """Return pose, correspondences, rivals and names as arrays by name; texts as objects; see `from_row`."""
         found = self.correspondences
         arrays: dict[str, Any] = {key: getattr(found, key).astype(dtype) for key, (dtype, _) in _STORED.items()}
         labels, codes = np.unique(found.found_by, return_inverse=True)
@@ -387,34 +394,23 @@ class QueryResult:
         arrays["rival_supports"] = np.array([rival.support for rival in self.rivals], np.float64)
         return arrays | {name: np.array(getattr(self, name), object) for name in _NAMES}
 
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Any]) -> Self:
-        """Return a result with the content of `arrays`; its status and numbers are in a row, see `with_row`.
 
-        Raises:
-            ValueError, KeyError: an array has another shape or is missing.
-        """
-        wide = {"f": np.float64, "i": np.int64, "b": np.bool_}
-        labels = np.array([_text(label) for label in arrays["found_by_labels"]], np.str_)
-        found_by = labels[arrays["found_by"].astype(np.int64)] if len(labels) else np.zeros(0, "U1")
-        read = {key: arrays[key].astype(wide[arrays[key].dtype.kind]) for key in _STORED}
-        for key, array in (read | {"found_by": found_by}).items():
-            count = len(read["view_of" if key.startswith("view_") else "camera"])
-            if array.shape != (count, *(_STORED[key][1] if key in _STORED else ())):
-                raise ValueError(f"{key} has the shape {array.shape}")
-        pose, covariance = arrays["world_from_rig"], arrays["covariance"]
-        images, references, rejected = (tuple(_text(text) for text in arrays[name]) for name in _NAMES)
-        return cls(
-            Status.FAILED,
-            world_from_rig=None if np.isnan(pose).all() else pose,
-            covariance=None if np.isnan(covariance).all() else covariance,
-            images=images,
-            references=references,
-            rejected=rejected,
-            correspondences=Correspondences(**read, found_by=found_by),
-            rivals=tuple(map(Rival, arrays["rivals"].reshape(-1, 4, 4), arrays["rival_supports"].tolist())),
-            camera_contradicted=bool(arrays["misfit"]),
-        )
+def _of_arrays(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the attributes of a result in its arrays."""
+    wide = {"f": np.float64, "i": np.int64, "b": np.bool_}
+    labels = np.array([_text(label) for label in arrays["found_by_labels"]], np.str_)
+    found_by = labels[arrays["found_by"].astype(np.int64)] if len(labels) else np.zeros(0, "U1")
+    read = {key: arrays[key].astype(wide[arrays[key].dtype.kind]) for key in _STORED}
+    for key, array in (read | {"found_by": found_by}).items():
+        count = len(read["view_of" if key.startswith("view_") else "camera"])
+        if array.shape != (count, *(_STORED[key][1] if key in _STORED else ())):
+            raise ValueError(f"{key} has the shape {array.shape}")
+    return {name: tuple(_text(text) for text in arrays[name]) for name in _NAMES} | {
+        **{name: None if np.isnan(arrays[name]).all() else arrays[name] for name in ("world_from_rig", "covariance")},
+        "correspondences": Correspondences(**read, found_by=found_by),
+        "rivals": tuple(map(Rival, arrays["rivals"].reshape(-1, 4, 4), arrays["rival_supports"].tolist())),
+        "camera_contradicted": bool(arrays["misfit"]),
+    }
 
 
 def _text(text: Any) -> str:

@@ -304,14 +304,14 @@ def _read_table(path: Path, messages: list[str]) -> pd.DataFrame:
 def _read_statuses(files: SceneFiles, messages: list[str]) -> pd.DataFrame:
     """Return `STATUS_COLUMNS` of every query of every pair, with or without ground truth."""
     tables = [pd.DataFrame()]
-    for path in pairs_of(files.poses_dir):
+    for devices, path in pairs_of(files.poses_dir).items():
         try:
-            results = PairResults.open(path)
+            table = PairResults.open(path).table
         except ArtifactError:
             messages.append(f"{path.name} cannot be read")
             continue
-        devices = dict(zip(("map_device", "query_device"), results.devices, strict=True))
-        tables.append(results.table.rename(columns=POSES_UNIT).reindex(columns=STATUS_COLUMNS).assign(**devices))
+        of_pair = dict(zip(review.PAIR, devices, strict=True))
+        tables.append(table.rename(columns=POSES_UNIT).reindex(columns=STATUS_COLUMNS).assign(**of_pair))
     return pd.concat(tables, ignore_index=True)
 
 
@@ -485,7 +485,7 @@ def _failures(queries: pd.DataFrame) -> Markup:
     if not len(failed):
         return Markup()
     # Drop details in parentheses: they differ from query to query for the same reason.
-    reasons = failed["status"].str.removeprefix("failed").str.replace(r" \(.*", "", regex=True).str.lstrip(": ")
+    reasons = failed["status"].map(lambda text: re.sub(r" \(.*", "", Status.parse(text)[1]))
     groups = _queries(failed).groupby(reasons.rename("reason"))
     where = groups.agg(lambda pairs: ", ".join(f"{pair} {count}" for pair, count in pairs.value_counts().items()))
     table = pd.DataFrame({"queries": groups.size(), "where": where})
@@ -499,7 +499,7 @@ def _wrong_ok(errors: pd.DataFrame, unit: str) -> Markup:
     """List the poses that are called ok but are wrong, the largest errors first."""
     if not len(errors):
         return Markup()
-    called_ok = errors[errors["status"] == "ok"]
+    called_ok = errors[statuses(errors["status"]) == Status.OK]
     turned, moved = called_ok[["rotation_error_deg", "translation_error_m"]].to_numpy(float).T
     wrong = called_ok[~metrics.is_below(turned, moved, metrics.WRONG)]
     wrong = wrong.sort_values("translation_error_m", ascending=False)

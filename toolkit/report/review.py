@@ -12,10 +12,10 @@ from toolkit.capture.names import in_order
 from toolkit.errors import ArtifactError
 from toolkit.figures.evaluation import wilson_interval
 from toolkit.figures.style import percent
-from toolkit.files import SceneFiles, map_record_path, pair_devices, read_map_record, write_text
+from toolkit.files import SceneFiles, map_record_path, read_map_record, write_text
 from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings
 from toolkit.pose.base import status_counts
-from toolkit.results.pair import AnySettings, load_maps, map_files, read_settings
+from toolkit.results.pair import AnySettings, load_maps, map_files, pairs_of, read_settings
 
 PAIR = ["map_device", "query_device"]
 COUNTS = ["queries", "ok", "low_confidence", "failed"]
@@ -117,8 +117,7 @@ def _heading(text: str) -> str:
 def maps_table(files: SceneFiles) -> pd.DataFrame:
     """Return a row for each map: its images, points, and observations of them, and whether its poses fit its images."""
     rows = []
-    pairs = sorted(files.poses_dir.glob("*_map_*_query_*.h5"))
-    h5_of = {pair_devices(path.stem)[0]: path for path in pairs}
+    h5_of = {map_device: path for (map_device, _), path in pairs_of(files.poses_dir, ".h5").items()}
     for device in in_order(h5_of):
         try:
             local_map = load_maps(map_files(files.maps, f"{device}_map", h5_of[device]))

@@ -131,6 +131,16 @@ class PairResults:
         return covariances
 
     @cached_property
+    def _keys(self) -> dict[tuple[int, str], int]:
+        keys = zip(self.table["timestamp"], self.table["device_id"], strict=True)
+        return {key: number for number, key in enumerate(keys)}
+
+    @cached_property
+    def _images(self) -> dict[str, int]:
+        listed = self.table.reindex(columns=["image"])["image"].fillna("").astype(str).str.split(";")
+        return {image: number for number, images in enumerate(listed) for image in images if image}
+
+    @cached_property
     def unit(self) -> tuple[str, float]:
         """The unit that lengths are shown in, see `metrics.length_unit`."""
         scene = self.path.stem.rpartition("_map_")[0]
@@ -155,27 +165,28 @@ class PairResults:
     def __iter__(self) -> Iterator[QueryResult]:
         return (self[number] for number in range(len(self)))
 
-    def __getitem__(self, number: int) -> QueryResult:
-        """Return the result of a query by its number in the table.
+    def __getitem__(self, query: int | str | tuple[int, str]) -> QueryResult:
+        """Return the result of a query by its number in the table, its (timestamp, device id), or the name of one of
+        its images, or a unique end of that.
 
         Raises:
-            ArtifactError: its correspondences are damaged (DamagedError) or cannot be read.
+            ArtifactError: there is no such query, or its correspondences are damaged (DamagedError) or cannot be read.
         """
-        row: dict[str, Any] = self.table.iloc[number].to_dict()
+        number = self._keys.get(query) if isinstance(query, tuple) else find_query(query, self._images, len(self))
+        if number is None:
+            raise ArtifactError(f"{self.path}: no query {query}.")
         pose, covariance = self.poses[number], self.covariances[number]
         return replace(
-            self.stored(int(row["timestamp"]), str(row["device_id"])).with_row(row),
+            self.stored(self.table.iloc[number].to_dict()),
             world_from_rig=pose if is_posed(pose) else None,
             covariance=None if np.isnan(covariance).all() else covariance,
         )
 
-    def stored(self, timestamp: int, device_id: str) -> QueryResult:
-        """Return the arrays of a query; empty if the stage could not process it."""
-        name = query_group(timestamp, device_id)
-        if not has_group(self._file, name):
-            return QueryResult(Status.FAILED)
+    def stored(self, row: Mapping[str, Any]) -> QueryResult:
+        """Return the result of the query of a row, with its arrays if the stage could process it."""
+        name = query_group(int(row["timestamp"]), str(row["device_id"]))
         try:
-            return QueryResult.from_arrays(read_group(self._file, name))
+            return QueryResult.from_row(row, read_group(self._file, name) if has_group(self._file, name) else None)
         except (*HDF5_ERRORS, AttributeError) as error:
             fault = f"{self.h5}: {name} is not as a run writes it ({first_line(error)}). Localize again."
             raise DamagedError(self.h5, fault) from None
@@ -246,10 +257,10 @@ def load_maps(paths: Sequence[Path]) -> LocalMap | None:
     return LocalMap.pooled(maps) if maps else None
 
 
-def pairs_of(poses_dir: str | Path) -> list[Path]:
-    """Return the tables of all pairs in a folder of poses, `<pair>.csv`."""
-    tables = sorted(Path(poses_dir).glob("*_map_*_query_*.csv"))
-    return [path for path in tables if all(pair_devices(path.stem)) and not of_sequence(path.stem)]
+def pairs_of(poses_dir: str | Path, suffix: str = ".csv") -> dict[tuple[str, str], Path]:
+    """Return a file of each pair in a folder of poses, by default its table, by (map device, query device)."""
+    paths = [path for path in sorted(Path(poses_dir).glob(f"*{suffix}")) if not of_sequence(path.stem)]
+    return {devices: path for path in paths if all(devices := pair_devices(path.stem))}
 
 
 def find_query(query: object, images: Mapping[str, int], count: int, what: str = "query") -> int:

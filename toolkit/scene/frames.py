@@ -18,7 +18,7 @@ from toolkit.scene.images import localize_image
 from toolkit.scene.map import Map
 from toolkit.scene.query import Image
 from toolkit.sequences.odometry import Odometry, cut, with_measured_drift
-from toolkit.sequences.pose_graph import FAR, PlacedPiece, is_sure, localize_piece, queries_of
+from toolkit.sequences.pose_graph import FAR, NO_QUERY, PlacedPiece, is_sure, localize_piece, queries_of
 from toolkit.threads import fixed_sums
 
 Images = Image | Sequence[Image] | None
@@ -35,7 +35,9 @@ class LocalizedFrames:
     covariances: Floats
     """(N, 6, 6) of a small motion in the rig's frame: rotation, radians, then translation, meters."""
     status: NDArray[np.object_]
-    """(N,) `ok`, `low_confidence: <reason>` or `failed: <reason>`."""
+    """(N,) `Status`; online None for frames without a picture."""
+    reason: NDArray[np.object_]
+    """(N,) why it is not `ok`, in few words."""
     piece: Ints
     """(N,) number of the piece of odometry; losses of tracking separate pieces."""
     single: dict[int, QueryResult]
@@ -100,7 +102,7 @@ def localize_sequence(
     localize = partial(_localize, scene_map, rig_from_cams, turns)
     single = {frame: localize(image, cams_of_frames[frame]) for frame, image in enumerate(images) if image is not None}
     piece, relocalized = np.zeros(len(odometry), int), dict[int, QueryResult]()
-    placed = list[PlacedPiece]()
+    placed = [PlacedPiece(np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), np.zeros(0, bool), *np.zeros((2, 0), object))]
     pieces, queries = odometry.split(), queries_of(single)
     if not settings.online:
         settings = with_measured_drift([(odometry.part(rows), queries.part(rows)) for rows in pieces], settings)
@@ -120,14 +122,9 @@ def localize_sequence(
         done = localize_piece(odometry.part(rows), queries.part(rows), frames - rows.start, settings, again)
         relocalized |= {rows.start + frame: estimate for frame, estimate in done.relocalized.items()}
         placed.append(done.placed)
-    return LocalizedFrames(
-        np.concatenate([np.zeros((0, 4, 4)), *(part.world_from_rig for part in placed)]),
-        np.concatenate([np.zeros((0, 6, 6)), *(part.covariances for part in placed)]),
-        np.concatenate([np.zeros(0, object), *(part.status for part in placed)]),
-        piece,
-        single,
-        relocalized,
-    )
+    names = ("world_from_rig", "covariances", "status", "reason")
+    joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in placed]) for name in names}
+    return LocalizedFrames(**joined, piece=piece, single=single, relocalized=relocalized)
 
 
 class SequenceLocalizer:
@@ -211,26 +208,26 @@ class SequenceLocalizer:
         done = localize_piece(self._motion, self._queries, np.array([len(self._motion) - 1]), offline, again)
         self._queries, placed = done.queries, done.placed
         self._solved = len(self._motion) - 1, placed
-        return self._estimate(placed.world_from_rig[-1], placed.covariances[-1], str(placed.status[-1]))
+        return self._estimate(placed.world_from_rig[-1], placed.covariances[-1], placed.status[-1], placed.reason[-1])
 
     def _extrapolate(self) -> QueryResult:
         """Return the pose of the latest frame by odometry from the last image."""
         if self._solved is None:
-            return QueryResult.failed("no query of this piece has a pose", found_by="sequence")
+            return QueryResult.failed(NO_QUERY, found_by="sequence")
         last, placed = self._solved
-        status = str(placed.status[-1])
+        status, reason = placed.status[-1], placed.reason[-1]
         since = self._motion.part(slice(last, None)).scaled(placed.scale)
         step = geometry.invert(since.odom_from_rig[0]) @ since.odom_from_rig[-1]
         rotation_std, position_std = since.drift(self._drift, np.array([0]), np.array([len(since) - 1]))
         position_std = np.hypot(position_std, self.settings.scale_std * np.linalg.norm(step[:3, 3]))
         covariance = carried_over(placed.covariances[-1], geometry.invert(step))
         covariance += np.diag(np.repeat([rotation_std[0], position_std[0]], 3) ** 2)
-        status = FAR if status == "ok" and not is_sure(covariance[None])[0] else status
-        return self._estimate(placed.world_from_rig[-1] @ step, covariance, status)
+        if status is Status.OK and not is_sure(covariance[None])[0]:
+            status, reason = Status.LOW_CONFIDENCE, FAR
+        return self._estimate(placed.world_from_rig[-1] @ step, covariance, status, reason)
 
-    def _estimate(self, pose: Floats, covariance: Floats, status: str) -> QueryResult:
-        parsed, reason = Status.parse(status)
+    def _estimate(self, pose: Floats, covariance: Floats, status: Status, reason: str) -> QueryResult:
         if not np.isfinite(pose).all():
-            return QueryResult(parsed, reason, found_by="sequence")
-        single = replace(self.single or QueryResult(parsed), status=parsed, reason=reason)
+            return QueryResult(status, reason, found_by="sequence")
+        single = replace(self.single or QueryResult(status), status=status, reason=reason)
         return replace(single, world_from_rig=pose, covariance=covariance, found_by="sequence")

@@ -354,12 +354,11 @@ class Map:
         if not fallback or not self.needs_fallback(query, references, result):
             return result
         query, first = self._with_fallback_features(query), result
-        for asked in self.rounds(references, first):
-            matches = self.match(query, asked, self.fallback)
-            query = replace(query, network_matches=matches.query.network_matches)  # the next round has them again
-            result = self.retry(query, matches, result, priors)
-            if self.is_settled(first, result):
-                break
+        for few in (True, False):
+            if asked := self.references_of_retry(few, references, first, result):
+                matches = self.match(query, asked, self.fallback)
+                query = replace(query, network_matches=matches.query.network_matches)  # the next round has them again
+                result = self.retry(query, matches, result, priors)
         return replace(result, seconds=time.perf_counter() - started)
 
     def predict(self, queries: Sequence[QueryInput]) -> list[Any]:
@@ -381,21 +380,22 @@ class Map:
             not isinstance(features, str) and len(found.images) for features, found in readable
         )
 
-    def rounds(self, references: Sequence[References], first: QueryResult) -> list[Sequence[References]]:
-        """Return the references that fallback features are matched with, in turn until the pose is sure.
+    def references_of_retry(
+        self, few: bool, references: Sequence[References], first: QueryResult, latest: QueryResult
+    ) -> Sequence[References]:
+        """Return the references that fallback features are matched with in the round of few references, or in that of
+        all, which follows; empty if the round is left out. `first` needs them, and `latest` is the latest result.
 
-        An `ok` pose only lacks precision, so the references that support it most are asked before all are.
+        An `ok` pose only lacks precision, so the references that support it most are asked before all are: these only
+        if the few have not made the pose sure, or have moved it elsewhere.
         """
-        if first.status is not Status.OK:
-            return [references]
-        best = [self.index_of[name] for name in first.references[:FEW_REFERENCES]]
-        few = [found.take(np.isin(found.images, best)) for found in references]
-        counts = [sum(len(found.images) for found in asked) for asked in (few, references)]
-        return [few, references] if 0 < counts[0] < counts[1] else [references]
-
-    def is_settled(self, first: QueryResult, result: QueryResult) -> bool:
-        """Tell whether few references have made the pose of the first result sure, and have not moved it elsewhere."""
-        return not self.is_unsure(result) and not self._differ(first.world_from_rig, result.world_from_rig)
+        if not few:
+            moved = self._differ(first.world_from_rig, latest.world_from_rig)
+            return references if moved or self.is_unsure(latest) else []
+        best = [self.index_of[name] for name in first.references[:FEW_REFERENCES] if first.status is Status.OK]
+        chosen = [found.take(np.isin(found.images, best)) for found in references]
+        counts = [sum(len(found.images) for found in asked) for asked in (chosen, references)]
+        return chosen if 0 < counts[0] < counts[1] else []
 
     @fixed_sums
     def retry(

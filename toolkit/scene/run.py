@@ -23,7 +23,6 @@ from toolkit.features.stores import FeatureStore, MatchStore, features_path
 from toolkit.files import (
     SceneFiles,
     image_name,
-    pair_devices,
     read_json,
     read_references,
     relative_url,
@@ -146,7 +145,7 @@ class InspectedPair:
         """Open a pair; folders are those of the run of `poses_dir`, and the capture's is as when the pair was
         localized, unless given. Raise ArtifactError if the pair does not exist, or its files are missing or torn.
         """
-        pairs = {pair_devices(path.stem): path for path in sorted(Path(poses_dir).glob("*_map_*_query_*.h5"))}
+        pairs = pairs_of(poses_dir, ".h5")
         if (map_device, query_device) not in pairs:
             known = [f"{query} in {mapped}" for mapped, query in pairs]
             fault = f"no correspondences of queries of {query_device!r} in the map of {map_device!r}, `<pair>.h5`"
@@ -247,8 +246,7 @@ class WorstQueries:
         and can be read. The folders are as for `InspectedPair`.
         """
         pairs: list[InspectedPair] = []
-        for path in sorted(Path(poses_dir).glob("*_map_*_query_*.h5")):
-            mapped, queried = pair_devices(path.stem)
+        for mapped, queried in pairs_of(poses_dir, ".h5"):
             if map_device in ("all", mapped) and query_device in ("all", queried):
                 with suppress(*OF_THE_DATA):  # an unfinished pair has no table, or a session broke after a good run
                     pairs.append(InspectedPair(mapped, queried, poses_dir, None, map_dir, sessions_root))
@@ -266,7 +264,7 @@ class WorstQueries:
         columns = ["map_device", "query_device", "status", "num_inliers", *errors, "image"]
         rows = []
         for pair, number in self._queries[:most]:
-            devices = dict(zip(columns, pair_devices(pair._h5.stem), strict=False))
+            devices = dict(zip(columns, pair.localized.results.devices, strict=False))
             rows.append({**pair.localized.localizations.errors.iloc[number].to_dict(), **devices})
         return pd.DataFrame(rows).reindex(columns=columns).replace(np.inf, np.nan)
 
@@ -449,9 +447,8 @@ class Run:
         """
         keys, tables = ["scene", "map_device", "query_device"], dict[tuple[str, ...], pd.DataFrame]()
         for scene in self.scenes:
-            for path in pairs_of(SceneFiles(self.path, scene).poses_dir):
-                results = PairResults.open(path)
-                tables[scene, *results.devices] = results.table
+            for devices, path in pairs_of(SceneFiles(self.path, scene).poses_dir).items():
+                tables[scene, *devices] = PairResults.open(path).table
         if not tables:
             return pd.DataFrame(columns=[*keys, "status"])
         return pd.concat(tables, names=keys).reset_index(keys).reset_index(drop=True)
@@ -517,11 +514,10 @@ class Run:
         queries, images = list[tuple[str, str, Session, Ints]](), dict[str, int]()
         for scene in self.scenes:
             pairs = pairs_of(SceneFiles(self.path, scene).poses_dir)
-            of_device = {pair_devices(path.stem)[1]: path for path in pairs}  # any pair with these queries
-            for device, path in of_device.items():
+            of_device = {device: (map_device, path) for (map_device, device), path in pairs.items()}  # any map
+            for device, (map_device, path) in of_device.items():
                 attributes = how_localized(path.with_suffix(".h5"))[1]
                 session = Capture.from_sessions_root(attributes[SESSIONS_ROOT])[f"{device}_query"]
-                map_device = pair_devices(path.stem)[0]
                 for rows in session.rows_of_keyframes(session.keyframes("all")):
                     images |= dict.fromkeys((session.image_name(int(row)) for row in rows), len(queries))
                     queries.append((scene, map_device, session, rows))

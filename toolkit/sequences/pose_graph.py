@@ -40,7 +40,8 @@ _ROUNDS = 8
 """Largest number of iterations of solving the graph and choosing the queries that fit."""
 MAX_STD_DEG, MAX_STD_M = 2.25, 0.2
 """Largest standard deviation of an `ok` pose, over all axes: 5 degrees and 0.5 m are more than 2.2 times as much."""
-FAR = "low_confidence: odometry is not sure so far from a query"
+FAR, NO_QUERY = "odometry is not sure so far from a query", "no query of this piece has a pose"
+"""Reasons of a status."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,9 @@ class PlacedPiece:
     used: NDArray[np.bool_]
     """(Q,) whether each query fits the poses; online, whether it fits the pose of its own frame."""
     status: NDArray[np.object_]
-    """(N,) `ok`, `low_confidence: <reason>` or `failed: <reason>`; online empty for frames without a query."""
+    """(N,) `Status`; online None for frames without a query."""
+    reason: NDArray[np.object_]
+    """(N,) texts, empty for `ok`."""
     scale: float = 1.0
     """Scale factor of the odometry; online that of the last pose."""
 
@@ -65,7 +68,7 @@ def place_online(odometry: Odometry, queries: PosedQueries, frames: Ints, settin
     count = len(odometry)
     piece = PlacedPiece(
         np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan), np.zeros(len(queries), bool),
-        np.full(count, "", object),
+        np.full(count, None, object), np.full(count, "", object),
     )  # fmt: skip
     for frame in frames.tolist():
         start = int(np.searchsorted(odometry.timestamps, odometry.timestamps[frame] - length_us))
@@ -76,7 +79,7 @@ def place_online(odometry: Odometry, queries: PosedQueries, frames: Ints, settin
         past, chosen = past.part(last), chosen.part(last)
         placed = place_piece(past, chosen, drifting)
         piece.world_from_rig[frame], piece.covariances[frame] = placed.world_from_rig[-1], placed.covariances[-1]
-        piece.status[frame] = placed.status[-1]
+        piece.status[frame], piece.reason[frame] = placed.status[-1], placed.reason[-1]
         piece.used[queries.frames == frame] = placed.used[chosen.frames == len(past) - 1]
         piece = replace(piece, scale=placed.scale)
     return piece
@@ -87,7 +90,7 @@ def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSet
     count = len(odometry)
     if not len(queries):
         nothing = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan), np.zeros(0, bool)
-        return PlacedPiece(*nothing, np.full(count, "failed: no query of this piece has a pose", object))
+        return PlacedPiece(*nothing, np.array([Status.FAILED] * count, object), np.full(count, NO_QUERY, object))
     best = place(odometry, queries, settings)[0]
     used, seen = best.members, set[bytes]()
     for _ in range(_ROUNDS):
@@ -102,7 +105,7 @@ def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSet
             break
         used = fit
     mask = np.isin(np.arange(len(queries)), used)
-    status = np.full(count, "ok", object)
+    status, reasons = np.array([Status.OK] * count, object), np.full(count, "", object)
     if not best.trusted:
         # `ok` queries that do not fit keep their own poses, because odometry may be what is wrong.
         alone = queries.choose(queries.trusted & ~mask)
@@ -111,11 +114,12 @@ def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSet
             reason = "odometry contradicts the queries"
         elif best.rival_support >= 0.5 * best.support > 0:
             reason = "another place is as likely"
-        status[:] = f"low_confidence: {reason}"
-        status[alone.frames], poses[alone.frames] = "ok", alone.world_from_rig
+        status[:], reasons[:] = Status.LOW_CONFIDENCE, reason
+        status[alone.frames], reasons[alone.frames], poses[alone.frames] = Status.OK, "", alone.world_from_rig
         covariances[alone.frames] = bounded(alone.covariances)
-    status[(status == "ok") & ~is_sure(covariances)] = FAR
-    return PlacedPiece(poses, covariances, mask, status, scale)
+    far = (status == Status.OK) & ~is_sure(covariances)
+    status[far], reasons[far] = Status.LOW_CONFIDENCE, FAR
+    return PlacedPiece(poses, covariances, mask, status, reasons, scale)
 
 
 def is_sure(covariances: Floats) -> NDArray[np.bool_]:
