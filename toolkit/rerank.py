@@ -5,7 +5,6 @@ fit one essential matrix of the two calibrated cameras, so the right reference c
 """
 
 import json
-import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -39,8 +38,6 @@ from toolkit.manifest import RerankSettings
 from toolkit.runs.pairs import PairRows
 from toolkit.store.items import Items, items_beside, remove_items, retry_damaged
 from toolkit.threads import one_thread
-
-log = logging.getLogger(__name__)
 
 
 @retry_damaged

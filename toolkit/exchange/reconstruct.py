@@ -10,7 +10,6 @@ or video that was given; its name is the first part of the names of its images.
 """
 
 import json
-import logging
 import shutil
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -59,7 +58,6 @@ from toolkit.scene.query import FOCAL_PRIOR
 from toolkit.store.items import Items, retry_damaged
 from toolkit.threads import one_thread
 
-log = logging.getLogger(__name__)
 T = TypeVar("T")
 FOLDER = "reconstruction"
 UNIT_HINT = "If you know a length, give --distance or --positions, or photographs with GPS"

@@ -31,7 +31,7 @@ from toolkit.figures.top_view import Ground, Layer, draw_layers, window_of
 from toolkit.files import image_name, pair_devices, read_references, require_current
 from toolkit.geometry import Floats, Ints
 from toolkit.results.metrics import MIN_OVERLAP, is_posed, overlap_of
-from toolkit.results.pair import find_query, load_maps, map_files
+from toolkit.results.pair import find_query
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,8 +61,6 @@ class RetrievedQuery:
     """(M,) similarity of the query to each map image."""
     overlap: Floats
     """(M,) overlap of each map image with the query, 0 to 1; NaN if unknown."""
-    points: str
-    """Points that overlap was computed from: `map` points, or a grid of points in the `view` of the map image."""
 
     @property
     def name(self) -> str:
@@ -93,13 +91,10 @@ class RetrievedPair:
         sessions_root: str | Path,
         jsonl: str | Path,
         embeddings: str | Path,
-        map_dir: str | Path | None = None,
-        poses_dir: str | Path | None = None,
     ) -> None:
         """Open the references of a pair, `<scene>_map_<M>_query_<Q>.jsonl`, with the descriptors in the folder
         `embeddings`.
 
-        Overlap is computed with the map points in `map_dir`, of the maps that the records in `poses_dir` name, if any.
         Raise ArtifactError if the references are missing, damaged, or older than the embeddings.
         """
         capture = Capture.from_sessions_root(sessions_root)
@@ -108,17 +103,15 @@ class RetrievedPair:
         self.session, self.map_session = capture[f"{query_device}_query"], capture[f"{map_device}_map"]
         require_current(jsonl, "retrieve", missing=False)
         self.embeddings, self.lines = Path(embeddings), read_references(jsonl, "path")
-        h5 = None if poses_dir is None else Path(poses_dir) / f"{jsonl.stem}.h5"
-        self.local_map = load_maps(map_files(map_dir, self.map_session.id, h5))
         self.names = [image_name(line["path"]) for line in self.lines]
         """Names of the query images."""
 
     def look(self, query: int | str = 0) -> RetrievedQuery:
         """Return the retrieval of a query image, by its number, its name, or a unique end of the name.
 
-        A map image overlaps with the query if at least `MIN_OVERLAP` of the map points that it observes lie in the
-        query's view at the true pose (`metrics.overlap_in_view`). Without a triangulated map, points at 2, 4, 8 and 16
-        m in the map image's view replace the map points; these ignore walls. Without a true pose, overlap is NaN.
+        A map image overlaps with the query if at least `MIN_OVERLAP` of points at 2, 4, 8 and 16 m in its view lie in
+        the query's view at the true pose (`metrics.overlap_in_view`); walls are ignored. Without a true pose, overlap
+        is NaN.
         Similarities are computed from the stored descriptors. Raise ArtifactError if no query matches, or several do
         (the nearest is named), or its descriptors are missing.
         """
@@ -138,10 +131,7 @@ class RetrievedPair:
             "name": names,
             "overlap": [overlap_of_row.get(map_row, np.nan) for map_row in map_rows],
         })  # fmt: skip
-        points = "view" if self.local_map is None else "map"
-        return RetrievedQuery(
-            self.session, self.map_session, number, row, references, images, similarity, overlap, points
-        )
+        return RetrievedQuery(self.session, self.map_session, number, row, references, images, similarity, overlap)
 
     def _similarities(self, row: int, references: Sequence[int]) -> tuple[Ints, Floats]:
         """Return the rows of posed map images in order, all `references` among them, and the query's similarities."""
@@ -178,7 +168,7 @@ class RetrievedPair:
         names = [session.image_name(int(image)) for image in images]
         of_images = zip(names, sensors, poses, strict=True)
         shown = ({"path": name, "sensor_id": sensor, "Tws": of_map} for name, sensor, of_map in of_images)
-        return np.array([overlap_of(image, session, self.local_map, pose, camera) for image in shown])
+        return np.array([overlap_of(image, session, None, pose, camera) for image in shown])
 
 
 @styled
@@ -208,10 +198,9 @@ def draw_retrieved(query: RetrievedQuery) -> "Figure":
     _draw_along(along, query, good, retrieved)
     _draw_from_above(above, query, good, retrieved)
     shared_legend(below, (along, above), ncols=4)
-    points = "the map points" if query.points == "map" else "points that the views are assumed to show"
     title = f"query image {query.number}: {shown_name(query.name)}"
     if query.is_known:
-        title += f"\ngreen: overlaps with the query by its true pose: sees {MIN_OVERLAP:.0%} of {points}"
+        title += f"\ngreen: overlaps with the query by its true pose: {MIN_OVERLAP:.0%} of points assumed in its view"
     figure.suptitle(title, fontsize=10)
     return figure
 

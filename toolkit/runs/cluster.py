@@ -28,7 +28,6 @@ from toolkit.threads import fixed_sums
 if TYPE_CHECKING:
     from distributed import Client
 
-log = logging.getLogger(__name__)
 
 ADDRESS = "TOOLKIT_CLUSTER"
 """Environment variable with the address of the scheduler whose workers the stages use."""

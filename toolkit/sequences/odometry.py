@@ -231,8 +231,6 @@ def bounded(covariances: Floats) -> Floats:
 class Placement:
     """A placement of odometry in the map: single poses that agree with each other, given the odometry between them."""
 
-    seed: int
-    """The query that all members agree with."""
     members: Ints
     """Queries that agree, ascending."""
     support: float
@@ -251,7 +249,7 @@ def place(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings)
     """
     agree = _agreement(odometry, queries, settings)
     left = np.ones(len(queries), bool)
-    clusters: list[tuple[int, Ints, float]] = []
+    clusters: list[tuple[Ints, float]] = []
     while left.any():
         seed = int(np.argmax(np.where(left, (agree & left) @ queries.weights, -1.0)))
         members = agree[seed] & left
@@ -259,16 +257,16 @@ def place(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings)
         with_others = agree[:, members] @ queries.weights[members]
         members &= with_others >= 0.5 * queries.weights[members].sum()
         members[seed] = True
-        clusters.append((seed, np.flatnonzero(members), float(queries.weights[members].sum())))
+        clusters.append((np.flatnonzero(members), float(queries.weights[members].sum())))
         left &= ~members
-    clusters.sort(key=lambda cluster: (-queries.weights[cluster[1]] @ queries.trusted[cluster[1]], -cluster[2]))
+    clusters.sort(key=lambda cluster: (-queries.weights[cluster[0]] @ queries.trusted[cluster[0]], -cluster[1]))
     placements = []
-    for number, (seed, rows, support) in enumerate(clusters):
-        rival = max((other for index, (_, _, other) in enumerate(clusters) if index != number), default=0.0)
+    for number, (rows, support) in enumerate(clusters):
+        rival = max((other for index, (_, other) in enumerate(clusters) if index != number), default=0.0)
         # Many weak poses are no evidence: a look-alike leads all of them to the same wrong place.
         independent = np.count_nonzero(queries.weights[rows] > _TELLING)
         sure = bool(queries.trusted[rows].any() or independent >= 3) and rival < 0.5 * support
-        placements.append(Placement(seed, rows, support, sure, rival))
+        placements.append(Placement(rows, support, sure, rival))
     return placements
 
 
