@@ -18,8 +18,8 @@ from tests.models.test_megaloc import tiny_megaloc
 from tests.models.test_vggt import tiny
 from tests.prediction.test_network import HIGHER, WIDE, Photographs, assert_same
 from tests.pretend import DEVICE, PretendTensor, pretending, resolved
-from toolkit.capture.masks import Masks
 from toolkit.embedders import megaloc, search
+from toolkit.embedders.masks import Masks
 from toolkit.features import network
 from toolkit.features.network import LightGlueMatcher, NetworkExtractor, SuperPointExtractor
 from toolkit.manifest import AlikedSettings, SuperPointSettings

@@ -13,10 +13,10 @@ import pytest
 from tests.test_embed import HL_RIG
 from toolkit import retrieve as retrieve_stage
 from toolkit.capture import Capture
-from toolkit.capture.masks import Masks, near
 from toolkit.embed import embed_sessions
 from toolkit.embedders import StoredVectors, Vectors
 from toolkit.embedders import search as search_module
+from toolkit.embedders.masks import Masks, near
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
 from toolkit.files import sidecar_path
 from toolkit.geometry import unit

@@ -15,10 +15,10 @@ import pandas as pd
 from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session, Trajectory
-from toolkit.capture.masks import Masks, combine, gps_masks, pose_masks, radio_masks
 from toolkit.capture.session import SUBSESSIONS
 from toolkit.capture.tables import SIGNALS
 from toolkit.embedders import Vectors, embedding_folders, load_embeddings, open_descriptors
+from toolkit.embedders.masks import Masks, combine, gps_masks, pose_masks, radio_masks
 from toolkit.embedders.search import (
     EXACT,
     Backend,

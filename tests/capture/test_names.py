@@ -13,7 +13,6 @@ from PIL import Image
 from toolkit import pipeline
 from toolkit.capture import Capture, Session
 from toolkit.capture.check import check_capture
-from toolkit.capture.depths import DepthMaps
 from toolkit.capture.names import (
     ALLOW_OUTSIDE,
     LINKED_HERE,
@@ -28,6 +27,7 @@ from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.interchange import import_images
 from toolkit.features.stores import extract_session
 from toolkit.manifest import load_manifest
+from toolkit.prediction.depths import DepthMaps
 
 CAMERA = "camera, PINHOLE, 64, 48, 50, 50, 32, 24"
 QT = "1, 0, 0, 0, 0, 0, 0"

@@ -14,10 +14,10 @@ from typer.testing import CliRunner
 from toolkit.__main__ import app
 from toolkit.capture import Capture
 from toolkit.capture.check import check_capture
-from toolkit.capture.depths import DepthMaps
 from toolkit.datasets.layouts import LAYOUTS, import_dataset
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.geometry import Floats, invert, make_pose, qt_from_pose, quaternion_to_rotation
+from toolkit.prediction.depths import DepthMaps
 
 Poses = dict[str, Floats]
 """The true world_from_cam by the end of the image's path."""

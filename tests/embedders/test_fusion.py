@@ -9,10 +9,10 @@ import faiss
 import numpy as np
 import pytest
 
-from toolkit.capture.masks import Masks
 from toolkit.embed import embed_sessions
 from toolkit.embedders import EMBEDDERS, MANIFEST_COLUMNS, load_embeddings
 from toolkit.embedders import search as search_module
+from toolkit.embedders.masks import Masks
 from toolkit.embedders.search import VectorIndex, Vectors, fuse, open_descriptors, search
 from toolkit.errors import ArtifactError, ManifestError, WeightsError
 from toolkit.figures.explore import draw_similarity

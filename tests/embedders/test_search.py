@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from toolkit.capture.masks import Masks
 from toolkit.embedders import StoredVectors, Vectors
 from toolkit.embedders import search as index_module
+from toolkit.embedders.masks import Masks
 from toolkit.embedders.search import load_index, make_index, search
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.files import sidecar_path

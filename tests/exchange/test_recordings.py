@@ -11,11 +11,11 @@ from typer.testing import CliRunner
 from toolkit.__main__ import app
 from toolkit.capture import Capture, Session
 from toolkit.capture.check import check_capture
-from toolkit.capture.depths import DepthMaps
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.interchange import import_colmap, import_images
 from toolkit.exchange.recordings import find_depths, lines_of_images, read_times, read_track
 from toolkit.geometry import Floats, invert, make_pose, qt_from_pose, quaternion_to_rotation
+from toolkit.prediction.depths import DepthMaps
 
 CAMERA = "PINHOLE, 64, 48, 50, 51, 32, 24"
 START_S = 1_305_031_102.175304

@@ -16,7 +16,6 @@ from tests.queries import session_query
 from tests.rendered import copy_shared
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
-from toolkit.capture.depths import lifted
 from toolkit.capture.names import ALLOW_OUTSIDE, allow_outside
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import SceneFiles, write_text
@@ -25,6 +24,7 @@ from toolkit.mapping.local_map import LocalMap
 from toolkit.pose.base import Query, QueryResult, References, View
 from toolkit.pose.map_matching import MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer
+from toolkit.prediction.depths import lifted
 from toolkit.prediction.feed_forward import FeedForwardAnswer, FeedForwardLocalizer, QueryPrediction
 from toolkit.prediction.hybrid import DepthLifter, HybridLocalizer
 from toolkit.prediction.interface import Prediction

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from toolkit.capture.masks import Masks
+from toolkit.embedders.masks import Masks
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.files import (
     file_fingerprint,

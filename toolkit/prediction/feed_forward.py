@@ -15,7 +15,6 @@ from toolkit import geometry
 from toolkit.alignment.robust import AlignmentError, robust_mean_pose
 from toolkit.alignment.similarity import Alignment, align_to_map, is_trustworthy, query_pose
 from toolkit.capture import Session
-from toolkit.capture.depths import DepthMaps, SeenDepth, lifted
 from toolkit.capture.images import in_view, view_bounds
 from toolkit.capture.upright import Turns
 from toolkit.errors import first_line, reason_of
@@ -36,6 +35,7 @@ from toolkit.pose.base import (
     View,
     carried_over,
 )
+from toolkit.prediction.depths import DepthMaps, SeenDepth, lifted
 from toolkit.prediction.interface import Prediction, Predictor
 from toolkit.threads import fixed_sums
 

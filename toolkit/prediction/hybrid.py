@@ -16,7 +16,6 @@ import numpy as np
 from toolkit import geometry
 from toolkit.alignment.similarity import DEPTH_NOISE
 from toolkit.capture import Session
-from toolkit.capture.depths import SeenDepth, lifted
 from toolkit.geometry import Floats, Ints
 from toolkit.manifest import LocalizeSettings, PnpSettings
 from toolkit.mapping.local_map import LocalMap
@@ -35,6 +34,7 @@ from toolkit.pose.base import (
 )
 from toolkit.pose.map_matching import MAX_MAP_FEATURES, MappedFeatures
 from toolkit.pose.pnp import PnpLocalizer, PnpMatches
+from toolkit.prediction.depths import SeenDepth, lifted
 from toolkit.prediction.feed_forward import CameraAnswer, FeedForwardAnswer, FeedForwardLocalizer, QueryPrediction
 from toolkit.threads import fixed_sums
 

@@ -23,7 +23,6 @@ from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
 from toolkit.capture import Capture, Session
-from toolkit.capture.depths import DepthMaps, lifted
 from toolkit.capture.images import (
     default_workers,
     in_view,
@@ -42,6 +41,7 @@ from toolkit.mapping.local_map import LocalMap, map_path
 from toolkit.models.compute import PRECISIONS, Fitting, on_device, resolve_device, resolve_precision
 from toolkit.models.weights import resolve_weights
 from toolkit.pose.base import View
+from toolkit.prediction.depths import DepthMaps, lifted
 from toolkit.prediction.interface import (
     ARCHITECTURES,
     HEADS,

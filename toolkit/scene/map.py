@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolkit import geometry
-from toolkit.capture import Capture, Session, masks
+from toolkit.capture import Capture, Session
 from toolkit.capture.images import thumbnails, turn_image
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_folders, open_descriptors, shows_upright
+from toolkit.embedders.masks import near as within
 from toolkit.embedders.search import VectorIndex, embedder_fingerprint, fuse, load_index, search
 from toolkit.errors import ArtifactError
 from toolkit.features.features import KINDS, SiftExtractor, usable
@@ -480,7 +481,7 @@ class Map:
 
     def _may_show(self, world_from_cam: Floats, near: RoughPose) -> NDArray[np.bool_] | None:
         """Return which searched map images (N,) may show what a camera at a rough pose sees; None if none may."""
-        mask = masks.near(
+        mask = within(
             self.session.world_from_cam(self.search.rows),
             world_from_cam,
             NEAR * self.length + 3 * near.position_std,
@@ -490,7 +491,7 @@ class Map:
 
     def _images_near(self, world_from_rig: Floats) -> Ints:
         """Return the map images, by index, that may show what a rig at a pose (4, 4) sees."""
-        return np.flatnonzero(masks.near(self._world_from_cams, world_from_rig, NEAR * self.length, NEAR_DEG))
+        return np.flatnonzero(within(self._world_from_cams, world_from_rig, NEAR * self.length, NEAR_DEG))
 
     @cached_property
     def _world_from_cams(self) -> Floats:

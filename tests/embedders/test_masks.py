@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from toolkit.capture import Session, Trajectory
-from toolkit.capture import masks as masks_module
-from toolkit.capture.masks import Masks, combine, gps_masks, near, pose_masks, radio_masks
+from toolkit.embedders import masks as masks_module
+from toolkit.embedders.masks import Masks, combine, gps_masks, near, pose_masks, radio_masks
 from toolkit.geometry import make_pose
 
 

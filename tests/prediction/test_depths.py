@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
 from toolkit.capture import Session, Trajectory, read_depth, write_depth, write_session
-from toolkit.capture.depths import MAX_OFFSET_US, DepthMaps, SeenDepth
+from toolkit.prediction.depths import MAX_OFFSET_US, DepthMaps, SeenDepth
 from toolkit.synthetic.render import Rays, Scene, paint, render
 
 Floats = NDArray[np.float64]
