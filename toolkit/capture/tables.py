@@ -69,7 +69,7 @@ _TYPES: dict[str, tuple[pa.DataType, float | None, str]] = {
 """Type in memory, largest absolute value, and what is expected, for messages, of each type of column."""
 POSES_UNIT = {"position_std": "position_std_m", "moved": "moved_m"}
 """Columns of lengths in a pair's table if the unit of its poses is unknown, and their names where it is the meter."""
-UNKNOWN_DEPTH = 65535
+UNKNOWN_DEPTH = 65535  # what some cameras write where they have none
 DEPTH_SCALE = 1000.0  # depth maps are 16-bit PNGs in millimeters
 _WIFI = "mac_addr, frequency_khz, rssi_dbm, name, scan_time_start_us, scan_time_end_us"
 _BLUETOOTH = "id, rssi_dbm, name"

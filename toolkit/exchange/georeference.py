@@ -21,7 +21,7 @@ from toolkit.geometry import Floats, invert, make_pose
 
 MAX_ERRORS_M = (0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Limits of the error of a known position; the smallest that `MOST` of the positions meet is used."""
-MOST = 0.6
+MOST = 0.6  # of the positions; the others may be blunders
 OUTLIER = 2.5  # smallest error of an outlier, in multiples of the median; for Gaussian noise, 3.8 standard deviations
 MAX_SCALE_DEVIATION = 0.1  # largest relative standard deviation of a scale that is used
 MAX_TILT_DEG = 2.0  # largest standard deviation of the vertical by known positions; else the cameras tell it

@@ -24,7 +24,7 @@ from toolkit.files import read_json, shipped, write_text
 _SHOWN = 10
 """Largest number of lines about reasons, and about cameras."""
 TEMPLATE = shipped("data_manifests") / "my-capture.yaml"
-MAX_PROBLEMS = 10
+MAX_PROBLEMS = 10  # that the report of an import names
 
 
 @dataclass

@@ -59,7 +59,7 @@ OF_MATCHES = (
 STATUS_COLORS = {Status.OK: GREEN, Status.LOW_CONFIDENCE: ORANGE, Status.FAILED: VERMILLION}
 SURE = 2.4477
 """Radius of the 95 % region of a 2D normal distribution, standard deviations."""
-MAX_POINTS = 20_000
+MAX_POINTS = 20_000  # drawn; more only take time
 NAMES, COLORS = ("as it was", "again"), (ESTIMATED, PURPLE)
 """Of the answers in a figure; a single answer is called `estimated`."""
 BELOW: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16), "ncols": 2, "fontsize": 7.5}

@@ -38,7 +38,7 @@ MIN_CHANGE = 0.03  # smallest change of intrinsics that is worth a word: of 1 %,
 IMITATED = 0.02  # change that systematic errors of SLAM poses imitate: KinectFusion's ask for 2 % of the focal length
 SIGNIFICANCE = 1e-5  # largest probability that noise alone asks for what is beyond the imitated change
 MIN_ANGLE = 5e-4  # radians; with smaller errors, principal points and distortions are right
-STEP = 1e-4
+STEP = 1e-4  # of numeric derivatives, and the smallest change of intrinsics that counts
 MAX_REST_FOCAL, MAX_REST = 0.8, 0.5  # share of the errors that may be left: noise of poses imitates the other two
 
 # Of the bundle adjustment

@@ -40,7 +40,7 @@ REFERENCES = ("saddle_balanced", "first")
 """Ways to choose the reference view, whose frame is the world."""
 _MIN_CHOICE = 3  # with fewer views, the first is the reference
 _NORM_EPS = 1e-5  # epsilon of the last norm, and of those on queries and keys
-_MIN_TANGENT = 1e-6
+_MIN_TANGENT = 1e-6  # of half the field of view, as in the authors' code
 _HEAD_DIM = 64
 _SIZES = (768, 384)
 """Channels of Base and Small."""

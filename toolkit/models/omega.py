@@ -40,7 +40,7 @@ PATCH = 16
 SPECIAL = 17
 """Number of tokens of a view before its patches: one camera token, then the registers."""
 _EPS = 1e-5
-_STORAGE = 4
+_STORAGE = 4  # tokens
 _POSE = 9
 _MIN_FIELD_OF_VIEW = 0.01  # radians
 

@@ -63,7 +63,7 @@ to focal length, principal point, radial distortion. Nominal principal points ar
 SUSPICIOUS = 0.01  # largest probability of the first step (a cheap test) for which the full test runs
 CERTAIN = 1e-6  # largest probability of the first step for which intrinsics are wrong even if no others are found
 WIDENINGS = (8.0, 8.0, 4.0, 2.0)  # factors of the inlier limit in the first steps: wrong intrinsics enlarge errors
-STEPS = 15
+STEPS = 15  # of the refinement of intrinsics, at most
 SETTLED_PX = 0.02  # largest motion of a projection in a step at which the fit has converged
 MIN_SCALE_PX = 0.5  # least scale of the Cauchy weights
 PRIOR_STD = (0.2, 0.02, 0.02, 0.05)  # prior standard deviations of the four `IntrinsicsCheck.parameters`

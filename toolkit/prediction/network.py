@@ -65,7 +65,7 @@ _KEPT = 256  # depth maps of map images kept in memory
 CACHE_BYTES = 2 << 30
 """Size of the cache for encodings of map images: 500 of them at 518 x 392 in float32, twice as many in bfloat16."""
 _GROUPS_AT_A_TIME = 8  # on a CPU 1: one group keeps it busy, and a batch needs more memory and is not faster
-_IMAGES_AT_A_TIME = 8
+_IMAGES_AT_A_TIME = 8  # decoded ahead and encoded together; more need more memory
 _loaded: dict[tuple[Any, ...], Any] = {}
 """The network that was loaded last, by its key; at most one."""
 

@@ -47,7 +47,7 @@ PATH_LOSS, WALL_DB, FADING_DB, MIN_DBM = 2.5, 6.9, 3.0, -92.0
 multi-wall model), standard deviation of a reading, and the level below which nothing is received."""
 RADIOS = {"ios": ("bt",), "hl": ("wifi", "bt"), "spot": ("wifi", "bt")}  # iOS does not let an app scan WiFi
 FORMAT = 3  # increase it when the same settings produce other bytes
-WRONG_FOCAL = 1.12
+WRONG_FOCAL = 1.12  # clearly wrong, and still localizable
 
 
 # Devices

@@ -42,7 +42,7 @@ SCENES = ("fountain-P11", "Herz-Jesus-P25", "entry-P10")
 """Scenes of the captures STRECHA and STRECHA_HARD."""
 THRESHOLDS: Sequence[tuple[float, float]] = ((1.0, 0.1), (2.0, 0.25), (5.0, 0.5))
 _APART_M = 100.0  # between the origins of two scenes
-_OVERSAMPLING = 3
+_OVERSAMPLING = 3  # per axis, against aliasing where an image is made smaller
 _DAY_TURN_DEG, _NIGHT_TURN_DEG = 0.5, 6.0
 """Largest angle by which a camera is turned from its place on the device: yaw, pitch, roll."""
 _ZOOM, _SMALLER = 1.25, 0.6

@@ -53,7 +53,7 @@ KINDS: dict[str, dict[str, Any]] = {
     },
 }  # fmt: skip
 LEVELS = 6  # mip levels; texture sides are multiples of 2 ** (LEVELS - 1)
-NEAR_M = 0.05
+NEAR_M = 0.05  # nothing nearer is drawn
 SAMPLES = 2  # per pixel and axis
 OFFSETS = np.array([[-0.125, 0.125], [0.375, 0.625]], np.float32)  # added to the mip level of each sample of a pixel
 
