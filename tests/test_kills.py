@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from itertools import chain, repeat
+from itertools import chain, product, repeat
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,8 @@ from toolkit.store.items import Items
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="needs fork and SIGKILL")]
 
 STAGES = ("embed", "retrieve", "rerank", "localize", "evaluate", "visualize")
-SIGNALS = [signal.SIGKILL] * 5 + [signal.SIGTERM]
-"""A round each, in which every stage is stopped once: 30 kills, and 6 friendly requests."""
+ROUNDS = [(signal.SIGKILL, signal.SIGKILL), (signal.SIGTERM, signal.SIGKILL), (signal.SIGKILL, signal.SIGKILL)]
+"""In a round every stage is stopped twice, the second time as it goes on: 30 kills, and 6 friendly requests."""
 
 
 class Runs:
@@ -120,13 +120,14 @@ def test_thirty_kills_at_random_moments_leave_the_same_files(runs: Runs, tmp_pat
     assert whole["status"] == 0, runs.log.read_text()
     expected = products(run)
     assert len(expected) > 20
-    stops = 0
-    for number, how in enumerate(chain(SIGNALS, repeat(signal.SIGKILL))):
-        if number >= len(SIGNALS) and stops >= 36:
+    stops = event = 0
+    for number, signals in enumerate(chain(ROUNDS, repeat(ROUNDS[0]))):
+        if number >= len(ROUNDS) and stops >= 36:
             break
         run.rename(tmp_path / f"whole-{number}")
-        for stage in STAGES:
-            event = rng.randint(1, whole["events"][stage])
+        for stage, (again, how) in product(STAGES, enumerate(signals)):
+            last = whole["events"][stage]
+            event = rng.randint(1, max(1, (last - event) // 2) if again else last)
             delay_s = rng.choice([0.0, rng.uniform(0.0, 0.3)])
             ended = runs.run(stage=stage, event=event, delay_s=delay_s, signal=how)
             if ended["status"] == 0:

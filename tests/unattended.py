@@ -2,9 +2,10 @@
 
 `python -m tests.unattended MANIFEST` imports all that a run needs, and then forks a process for each line of its
 standard input, a JSON object {stage, event, delay_s, signal}: the process runs the manifest, the real notebooks' cells
-executed in it, and is sent the signal `delay_s` after its file operation number `event` in that stage; `{}` lets it run
-to its end. One line of JSON comes back: {stopped, status, events}: whether the signal was sent, how the process ended,
-and, of one that ended well, the number of file operations of each stage.
+executed in it, and is sent the signal `delay_s` after its file operation number `event` in that stage, or the first of
+a later stage if there are fewer; `{}` lets it run to its end. One line of JSON comes back: {stopped, status, events}:
+whether the signal was sent, how the process ended, and, of one that ended well, the number of file operations of each
+stage.
 """
 
 import json
@@ -28,31 +29,34 @@ from nbformat.v4 import new_output
 from toolkit import embed, evaluate, localize, notebook, pipeline, rerank, retrieve, visualize  # noqa: F401
 from toolkit.figures import explore  # noqa: F401
 from toolkit.files import write_atomic
+from toolkit.manifest import STAGES
 from toolkit.report import page  # noqa: F401
 from toolkit.runs.kernel import TEXT_BARS
 
 CHANGES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}
 """Audit events that change a folder; `open` for writing is the other."""
 STAGE_OF = {path.name: path.stem.partition("_")[2] for path in notebook.NOTEBOOKS.glob("*.ipynb")}
+ORDER = ("", *STAGES)
 
 
 class Events:
     """Counts the operations on files below a folder by stage, and tells when one of them is about to happen."""
 
     def __init__(self, folder: Path, stage: str | None, event: int, tell: int) -> None:
-        """`tell`: a file descriptor that gets a byte at operation number `event`, from 1, of `stage`."""
+        """`tell`: a file descriptor that gets a byte at operation number `event`, from 1, of `stage`, or after it."""
         self.counts = Counter[str]()
         self.stage = ""
-        self._folder, self._told = str(folder), (stage, event, tell)
+        self._folder, self._tell = str(folder), tell
+        self._at = (ORDER.index(stage), event) if stage else None
         sys.addaudithook(self._hook)
 
     def _hook(self, name: str, arguments: tuple[Any, ...]) -> None:
         writes = bool(arguments[2] & (os.O_WRONLY | os.O_RDWR)) if name == "open" else name in CHANGES
         if writes and str(arguments[0]).startswith(self._folder):
             self.counts[self.stage] += 1
-            stage, event, tell = self._told
-            if (self.stage, self.counts[self.stage]) == (stage, event):
-                os.write(tell, b"!")
+            if self._at and (ORDER.index(self.stage), self.counts[self.stage]) >= self._at:
+                self._at = None
+                os.write(self._tell, b"!")
 
 
 def run_cells(content: Any, variables: dict[str, Any], parameters: dict[str, Any]) -> None:
