@@ -8,6 +8,7 @@ whether the signal was sent, how the process ended, and, of one that ended well,
 stage.
 """
 
+import ast
 import json
 import os
 import select
@@ -15,7 +16,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,6 +24,7 @@ from typing import Any
 
 import nbformat
 import pytest
+from IPython.core.formatters import DisplayFormatter
 from nbformat.v4 import new_output
 
 # Imported before the first fork, all that the cells need.
@@ -59,19 +61,32 @@ class Events:
                 os.write(self._tell, b"!")
 
 
-def run_cells(content: Any, variables: dict[str, Any], parameters: dict[str, Any]) -> None:
-    """Execute the cells of a notebook in this process, with these variables; as papermill, with these parameters."""
+def run_cells(
+    content: Any, variables: dict[str, Any], parameters: dict[str, Any], show: Callable[[Any], object] | None = None
+) -> None:
+    """Execute the cells of a notebook in this process, with these variables; as papermill, with these parameters.
+
+    `show` gets what a cell ends with.
+    """
     for cell in content.cells:
         if cell.cell_type == "code":
             source = "\n".join(line for line in cell.source.split("\n") if not line.startswith("%"))
-            exec(compile(source, cell.id, "exec"), variables)
+            *lines, last = ast.parse(source).body
+            if show is None or not isinstance(last, ast.Expr) or source.endswith(";"):
+                exec(compile(source, cell.id, "exec"), variables)
+            else:
+                exec(compile(ast.Module(lines, []), cell.id, "exec"), variables)
+                value = eval(compile(ast.Expression(last.value), cell.id, "eval"), variables)
+                if value is not None:
+                    show(value)
             if "parameters" in cell.metadata.get("tags", []):
                 variables |= parameters
 
 
 def execute_cells(
-    events: Events | SimpleNamespace, path: Path, output: Path, parameters: dict[str, Any], *_: object
-) -> tuple[Any, float]:
+    events: Events | SimpleNamespace, path: Path, output: Path, parameters: dict[str, Any], *_: object,
+    show: Callable[[Any], object] | None = None,
+) -> tuple[Any, float]:  # fmt: skip
     """Do what `toolkit.notebook.execute` does, in this process; of what cells display, counts alone are kept."""
     import IPython.display
 
@@ -87,7 +102,7 @@ def execute_cells(
     IPython.display.display = display
     variables: dict[str, Any] = {"display": display}
     notebook._user_names = lambda: variables
-    run_cells(content, variables, parameters)
+    run_cells(content, variables, parameters, show)
     content.cells[-1].outputs = outputs
     with write_atomic(output) as temporary:
         nbformat.write(content, temporary)
@@ -96,7 +111,10 @@ def execute_cells(
 
 @contextmanager
 def no_kernels() -> Iterator[None]:
-    """Runs execute the cells of their notebooks in this process, in the folder where a kernel would."""
+    """Runs execute the cells of their notebooks in this process, in the folder where a kernel would.
+
+    What a cell ends with is made into HTML and pictures as in a kernel; nothing is kept of it.
+    """
 
     def execute_here(path: Path, output: Path, *arguments: Any) -> tuple[Any, float]:
         with pytest.MonkeyPatch.context() as inside:
@@ -106,7 +124,7 @@ def no_kernels() -> Iterator[None]:
             output = output.resolve()
             output.parent.mkdir(exist_ok=True)
             inside.chdir(output.parent)
-            return execute_cells(SimpleNamespace(), path, output, *arguments)
+            return execute_cells(SimpleNamespace(), path, output, *arguments, show=DisplayFormatter().format)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "execute", execute_here)
