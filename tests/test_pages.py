@@ -73,8 +73,8 @@ ALONE = (
     "visloc import panoramas MAP",
 )
 """Commands that make a capture of their own: the pages name them as alternatives, so no earlier one is there."""
-WITH_KERNELS = ("visloc reconstruct PHOTOS MY_PLACE --hold-out 8", "visloc run data_manifests/my-place.yaml")
-"""Runs of all stages whose notebooks have kernels, without poses of their own and with them."""
+WITH_KERNELS = ("visloc run data_manifests/my-place.yaml",)
+"""Runs of all stages whose notebooks have kernels."""
 ORIGIN = np.array([47.37, 8.54, 408.0])
 """Latitude and longitude (degrees) and altitude (meters) of the photographs."""
 
