@@ -56,9 +56,9 @@ METHODS: dict[str, dict[str, Any]] = {
 OF_A_RIG = ("pnp", "hybrid", "aliked", "superpoint", "a network, hybrid")
 DOORS = [(name, "ios", ["ios", "spot"] if name in OF_A_RIG else ["ios"]) for name in METHODS]
 """Methods, map device and query devices; one run has all pairs of a method, because kernels take seconds to start."""
-IN_OTHERS = ("nearest", "feed_forward", "hybrid", "aliked", "superpoint", "a network, hybrid")
+IN_OTHERS = ("nearest", "feed_forward", "hybrid", "aliked", "aliked, lightglue", "superpoint", "a network, hybrid")
 """Methods whose runs have no kernels, because what they compute is in runs that have: "a network, feed_forward" has the
-size of images that users have, and LightGlue gets the same features."""
+size of images that users have, LightGlue gets the same features, and "sift and aliked" matches with it, too."""
 
 
 @pytest.fixture
