@@ -439,9 +439,7 @@ def test_names_that_fit_two_files_are_not_guessed(tmp_path: Path) -> None:
     assert report.images.set_index("image")["status"].to_dict() == {"Img.jpg": "no such file", "good.jpg": "imported"}
 
 
-def test_files_that_are_not_photographs_are_said(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_that_are_not_photographs_are_said(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     for name in ("x.heic", "y.HEIC", "z.gif"):
         (folder / name).write_bytes(b"anything")
