@@ -554,14 +554,8 @@ def _write_poses(path: Path, rows: Sequence[dict[str, Any]], settings: LocalizeS
 
 
 def explain_query(
-    sessions_root: str | Path,
-    retrieval_dir: str | Path,
-    features_dir: str | Path,
-    map_dir: str | Path,
-    map_device: str,
-    query_device: str,
-    settings: LocalizeSettings,
-    queries: str = "keyframes_pruned_subsampled",
+    sessions_root: str | Path, retrieval_dir: str | Path, features_dir: str | Path, map_dir: str | Path,
+    map_device: str, query_device: str, settings: LocalizeSettings, queries: str = "keyframes_pruned_subsampled",
     index: int = 0,
 ) -> tuple[FeedForwardLocalizer, Query, FeedForwardAnswer]:  # fmt: skip
     """Run the predictor on one query of a pair again, by its index in the keyframe list, with what `localize_pairs` was

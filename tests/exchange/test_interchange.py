@@ -439,9 +439,7 @@ def test_names_that_fit_two_files_are_not_guessed(tmp_path: Path) -> None:
     assert report.images.set_index("image")["status"].to_dict() == {"Img.jpg": "no such file", "good.jpg": "imported"}
 
 
-def test_files_that_are_not_photographs_are_said(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_that_are_not_photographs_are_said(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     for name in ("x.heic", "y.HEIC", "z.gif"):
         (folder / name).write_bytes(b"anything")
@@ -602,6 +600,48 @@ def test_queries_without_intrinsics_are_of_the_camera_of_the_map_that_took_them(
     )
     assert found["left/9.jpg"] == [50, 50, 31, 25]
     assert images["status"][["other/9.jpg", "small/9.jpg"]].str.startswith("no focal length in EXIF").all()
+
+
+def import_map(folder: Path, focals: dict[str, float], tags: dict[str, dict[int, object]]) -> Path:
+    """Import a map of images with known intrinsics, and return its session."""
+    rows = ["image,qw,qx,qy,qz,tx,ty,tz,model,width,height,params"]
+    for number, (name, focal) in enumerate(focals.items()):
+        save(folder / "map" / name, tags=tags.get(name))
+        rows.append(f"{name},1,0,0,0,{number},0,0,PINHOLE,64,48,{focal} {focal} 32 24")
+    (folder / "map.csv").write_text("\n".join(rows) + "\n")
+    import_images(folder / "map", folder / "PLACE", split="map", table=folder / "map.csv")
+    return folder / "PLACE/sessions/ios_map"
+
+
+def test_a_camera_of_the_map_is_known_by_all_its_folders(tmp_path: Path) -> None:
+    """Recordings with equal intrinsics share a camera; only the folder of its first image was compared."""
+    import_map(tmp_path, {"first/1.jpg": 50.0, "second/1.jpg": 50.0, "third/1.jpg": 60.0}, {})
+    for name in ("first", "second", "third", "fourth"):
+        save(tmp_path / f"queries/{name}/9.jpg")
+    images = import_images(tmp_path / "queries", tmp_path / "PLACE").images.set_index("image")["status"]
+    assert images[images == "imported"].index.tolist() == ["first/9.jpg", "second/9.jpg", "third/9.jpg"]
+
+
+@pytest.mark.parametrize("other", [{0x920A: 50.0}, {0x010F: "Other"}])
+def test_the_camera_of_the_map_is_not_one_that_exif_contradicts(tmp_path: Path, other: dict[int, object]) -> None:
+    """Of equal size, and with a lens or maker that EXIF tells, without a focal length in pixels."""
+    import_map(tmp_path, {"1.jpg": 50.0}, {"1.jpg": {0x920A: 24.0, 0x010F: "Maker"}})
+    save(tmp_path / "queries/other.jpg", tags=other)
+    save(tmp_path / "queries/same.jpg", tags={0x010F: "Maker"})
+    save(tmp_path / "queries/without.jpg")
+    images = import_images(tmp_path / "queries", tmp_path / "PLACE").images.set_index("image")["status"]
+    assert images.drop("other.jpg").eq("imported").all()
+    assert images["other.jpg"].startswith("no focal length in EXIF")
+
+
+@pytest.mark.parametrize("torn", ["sensors.txt", "images.txt"])
+def test_queries_are_imported_beside_a_map_that_cannot_be_read(tmp_path: Path, torn: str) -> None:
+    session = import_map(tmp_path, {"1.jpg": 50.0}, {})
+    (session / torn).write_text("# none\ntorn\n")
+    save(tmp_path / "queries/1.jpg", tags={0xA405: 26})
+    report = import_images(tmp_path / "queries", tmp_path / "PLACE")
+    assert report.images["status"].tolist() == ["imported"]
+    assert any(note.startswith("ios_map cannot be read") and torn in note for note in report.record["notes"])
 
 
 def test_an_image_of_absurd_size_is_a_row(folder: Path, tmp_path: Path) -> None:

@@ -176,7 +176,13 @@ def test_matches_from_a_file_lack_what_could_not_be_read() -> None:
         return scene.features[name] if name in pairs else LocalFeatures.none(SIZE)
 
     query = replace(scene.query, network_matches=[[pairs.__getitem__]])
-    assert_right(scene.localizer(source=source).localize(query, scene.references))
+    result = scene.localizer(source=source).localize(query, scene.references)
+    assert_right(result)
+    # Matches of an image that could be read in an earlier run are still in the file.
+    earlier = ByPoint().match([(scene.query.features[0][0], scene.features[scene.names[0]])])[0]  # type: ignore[list-item]
+    stale = replace(scene.query, network_matches=[[{scene.names[0]: earlier, **pairs}.__getitem__]])
+    again = scene.localizer(source=source).localize(stale, scene.references)
+    np.testing.assert_array_equal(again.world_from_rig, result.world_from_rig)
 
 
 def test_references_that_are_known_are_not_matched_again() -> None:

@@ -143,3 +143,17 @@ def test_a_query_is_found_by_number_key_and_image(tmp_path: Path) -> None:
     for unknown in ((7, "nobody"), "c.jpg", len(keys)):
         with pytest.raises(ArtifactError, match=r"no query|expected a number"):
             results[unknown]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("column", [{}, {"image": np.nan}], ids=["no column", "no names"])
+def test_a_table_without_names_of_images_is_read(tmp_path: Path, column: dict[str, float]) -> None:
+    """pandas warned that it will not fill missing numbers with texts."""
+    path = tmp_path / "P_map_ios_query_hl.h5"
+    write_queries(path, QUERIES)
+    (key, result), *_ = QUERIES.items()
+    results = PairResults(path.with_suffix(".txt"), pd.DataFrame([result.to_row(*key) | column]))
+    Trajectory.from_poses([key[0]], [key[1]], np.eye(4)[None]).write(results.path)
+    assert results[0].images == results[key].images == result.images
+    with pytest.raises(ArtifactError, match="There are none"):
+        results["0.jpg"]

@@ -35,6 +35,7 @@ from toolkit.pose.base import (
 )
 from toolkit.scene.images import localize_images
 from toolkit.scene.map import Map, ReferenceSearch
+from toolkit.scene.query import MapCameras, camera_key
 
 
 class Scripted(Localizer):
@@ -188,7 +189,7 @@ class OfOneCamera:
     """A map in which images (H, W) of value 1 tell that the true focal length is 500 px, those of value 0 nothing, and
     those of value 2 only that it is no small one."""
 
-    session = SimpleNamespace(sensors=pd.DataFrame({"sensor_type": [], "sensor_id": []}))
+    cameras: Any = None
 
     def query(self, image: Any, camera: pycolmap.Camera, *_: Any) -> Query:
         return Query([View("image", image, camera, False)], np.eye(4)[None])
@@ -217,6 +218,17 @@ def test_images_of_one_camera_share_what_one_of_them_tells_of_its_focal_length()
     assert alone[0].status_text == "low_confidence: camera?"
 
 
+def test_images_of_two_cameras_of_the_map_do_not_share_a_focal_length() -> None:
+    image, left, right = (
+        np.zeros((48, 64), np.uint8),
+        *(
+            pycolmap.Camera(model="SIMPLE_PINHOLE", width=64, height=48, params=[focal, 32.0, 24.0])
+            for focal in (50, 90)
+        ),
+    )
+    assert camera_key(image, left) == camera_key(image, left) != camera_key(image, right)
+
+
 def test_a_focal_length_that_fits_as_others_do_is_not_ok() -> None:
     """A photograph squeezed to half of its height was ok with a focal length three times too long, 13 units away."""
     (result,) = localize_images(OfOneCamera(), [np.full((48, 64), 2, np.uint8)])  # type: ignore[arg-type]
@@ -224,15 +236,25 @@ def test_a_focal_length_that_fits_as_others_do_is_not_ok() -> None:
     assert result.remark == "focal length 500 px, which fits its matches, as other intrinsics do"
 
 
+@pytest.mark.parametrize("of_map", [False, True], ids=["EXIF", "camera of the map"])
 @pytest.mark.parametrize(("side", "status"), [(64, "ok"), (128, "low_confidence: camera?")])
 def test_a_cropped_image_is_ok_only_if_the_matches_tell_its_principal_point(
-    tmp_path: Path, side: int, status: str
+    tmp_path: Path, side: int, status: str, of_map: bool
 ) -> None:
-    """A crop of a corner that kept its EXIF was ok 1.5 m and 19 degrees off."""
+    """A crop of a corner that kept its EXIF was ok 1.5 m and 19 degrees off. The map's may be of another corner."""
     exif = PIL.Image.Exif()
     exif.get_ifd(0x8769).update({0xA405: 35, 0xA002: side, 0xA003: 48})
     PIL.Image.new("RGB", (64, 48)).save(tmp_path / "a.jpg", exif=exif)
-    (result,) = localize_images(OfOneCamera(), [tmp_path / "a.jpg"])  # type: ignore[arg-type]
+    scene_map = OfOneCamera()
+    if of_map:
+        camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=64, height=48, params=[500.0, 32.0, 24.0])
+        sensors = pd.DataFrame({"sensor_type": ["camera"], "sensor_id": ["cam"]})
+        images = pd.DataFrame({"sensor_id": ["cam"], "path": ["a.jpg"]})
+        session: Any = SimpleNamespace(
+            sensors=sensors, images=images, camera=lambda _: camera, image_path=lambda _: tmp_path / "a.jpg"
+        )
+        scene_map.cameras = MapCameras(session)
+    (result,) = localize_images(scene_map, [tmp_path / "a.jpg"])  # type: ignore[arg-type]
     assert result.status_text == status
 
 

@@ -201,9 +201,8 @@ def import_images(
         texts = [one if isinstance(one, str) else camera_text(one) for one in listed_cameras.values()]
         listed_cameras = dict(zip(texts, listed_cameras.values(), strict=True))
     shared_camera = None if camera is None else camera_at("camera", camera)
-    map_session = draft.session.with_name(f"{device}_map")
     unknown = camera is None and not listed_cameras and not {"model", "camera_id"} & {*rows}
-    of_map = MapCameras(Session.open(map_session)) if unknown and split == "query" and map_session.is_dir() else None
+    of_map = _map_cameras(draft, device) if unknown and split == "query" else None
     posed = rows if truth is None else _read_truth(Path(truth), rows, draft, tracks[1])
     poses = _poses_of(posed, poses_are)
     bad = posed[posed["problem"] != ""] if "problem" in posed else posed[:0]
@@ -340,6 +339,16 @@ def camera_at(where: object, params: str) -> pycolmap.Camera:
         return parse_camera("camera", params)
     except ValueError as error:
         raise CaptureError(f"{where}: {error}") from None
+
+
+def _map_cameras(draft: Draft, device: str) -> MapCameras | None:
+    """Return the cameras of the map that queries are imported beside; None if there is no map, or none to be read."""
+    session = draft.session.with_name(f"{device}_map")
+    try:
+        return MapCameras(Session.open(session)) if session.is_dir() else None
+    except (CaptureError, OSError) as error:
+        draft.notes.append(f"{session.name} cannot be read, so its cameras are not used: {error}")
+        return None
 
 
 def _camera_of(

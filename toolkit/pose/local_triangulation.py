@@ -147,9 +147,12 @@ class OnDemandLocalizer(Localizer):
             if query.network_matches:
                 known = query.network_matches[camera][number] or known
             for name in (self.posed.names[index] for index in retrieved.images):
+                if not len(features[name]):  # matches of its earlier content may still be stored
+                    matches[camera][name] = PairMatches.none()
+                    continue
                 try:
                     matches[camera][name] = known(name)
-                except KeyError:  # a reference that could not be read, or was not asked before
+                except KeyError:  # not asked before
                     to_match[camera, name] = query_features[number], features[name]
         with self._network:
             new_matches = method.matcher.match(list(to_match.values()))

@@ -137,8 +137,9 @@ class PairResults:
 
     @cached_property
     def _images(self) -> dict[str, int]:
-        listed = self.table.reindex(columns=["image"])["image"].fillna("").astype(str).str.split(";")
-        return {image: number for number, images in enumerate(listed) for image in images if image}
+        listed = self.table["image"].astype(object) if "image" in self.table else ()  # other tools may not list them
+        named = enumerate("" if pd.isna(images) else str(images) for images in listed)
+        return {image: number for number, images in named for image in images.split(";") if image}
 
     @cached_property
     def unit(self) -> tuple[str, float]:

@@ -14,7 +14,7 @@ from toolkit.capture.images import sees_all
 from toolkit.errors import ArtifactError, CameraError, ImageError, reason_of
 from toolkit.pose.base import CAMERA, Query, QueryResult, RoughPose, Status
 from toolkit.scene.map import Map
-from toolkit.scene.query import Image, MapCameras, camera_key, guessed_camera, with_focal
+from toolkit.scene.query import Image, camera_key, guessed_camera, with_focal
 
 FOCAL_STEPS, FOCAL_DOUBT = 3, 1.3
 """Steps of the estimate of an unknown focal length; the matches must contradict one that is larger or smaller by a
@@ -59,8 +59,9 @@ def localize_images(
 ) -> list[QueryResult]:
     """Localize images, each alone, as `localize_image` does. Without a camera, images of one camera help each other.
 
-    Those with equal size, and in EXIF equal camera and focal length, are of one camera. The median of the focal lengths
-    that matches of its `ok` images tell, weighted by inliers, is tried for the other images.
+    Those with equal size, in EXIF equal camera and focal length, and the same camera of the map, if any, are of one
+    camera. The median of the focal lengths that matches of its `ok` images tell, weighted by inliers, is tried for the
+    other images.
 
     Returns:
         One result per image. If an image cannot be read or does not fit the camera, it is `failed`, with the reason.
@@ -104,7 +105,7 @@ class _UnknownFocal:
         self, scene_map: Map, image: Image, turns: Sequence[int] | None = None, near: RoughPose | None = None
     ) -> None:
         self.scene_map, self.image, self.turns, self.near = scene_map, image, turns, near
-        self.camera, self.origin, self.cropped = guessed_camera(image, MapCameras(scene_map.session))
+        self.camera, self.origin, self.cropped = guessed_camera(image, scene_map.cameras)
         self.described: Query | None = None  # with features, while different intrinsics are tried
 
     def locate(self, focal_px: float, right: float = 0.0, down: float = 0.0) -> QueryResult:

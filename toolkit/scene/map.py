@@ -75,7 +75,7 @@ from toolkit.results.pair import (
     pairs_in_map,
     read_settings,
 )  # fmt: skip
-from toolkit.scene.query import answer_of, query_from, show_matches, what_if, with_changes
+from toolkit.scene.query import MapCameras, answer_of, query_from, show_matches, what_if, with_changes
 from toolkit.threads import fixed_sums
 
 if TYPE_CHECKING:
@@ -643,6 +643,11 @@ class Map:
         """Pose (4, 4) of each map image by its name, if the map was built with refined poses; else empty."""
         refined = self._first and self.settings.map is not None and self.settings.map.refine_poses
         return self._first.poses if self._first and refined else {}
+
+    @cached_property
+    def cameras(self) -> MapCameras:
+        """The cameras of its images, among which that of an image without intrinsics is looked for."""
+        return MapCameras(self.session)
 
     @property
     def length(self) -> float:

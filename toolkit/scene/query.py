@@ -7,7 +7,7 @@ import operator
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -137,58 +137,74 @@ class MapCameras:
     """The cameras of a map, among which that of another image is looked for."""
 
     def __init__(self, session: Session) -> None:
-        self._session = session
+        """Take the map's session; raise CaptureError if the intrinsics of a camera are malformed."""
         sensors = session.sensors
         ids = sensors.loc[sensors["sensor_type"] == "camera", "sensor_id"].head(MAX_MAP_CAMERAS)
-        self._cameras = {str(name): session.camera(str(name)) for name in ids}
-        self._alike = dict[tuple[int, int], dict[str, str]]()
+        self._session, self._cameras = session, {str(name): session.camera(str(name)) for name in ids}
+        first = session.images.drop_duplicates("sensor_id")["sensor_id"]
+        self._images = {name: session.image_path(row) for row, name in first.items() if name in self._cameras}
+        """An image of each camera that has one."""
+        self._keys = dict[str, tuple[str, ...]]()
+        self._alike = dict[Any, dict[str, str]]()
 
-    def of_size(self, size: tuple[int, int]) -> dict[str, str]:
-        """Return the sensors of images of this width and height; for each its intrinsics, as text."""
-        if size not in self._alike:
+    def find(self, size: tuple[int, int], key: tuple[str, ...], folder: str, loosely: bool) -> GuessedCamera | None:
+        """Return the intrinsics of the only camera that may have taken an image; None if there is none, or several.
+
+        Args:
+            size: width and height of the image.
+            key: of the image in EXIF, see `exif_key`. That of the camera's first image is equal.
+            folder: name of the image's folder. Of several cameras, those with images in a folder of this name count.
+            loosely: if there is no such camera, one whose EXIF does not contradict is enough.
+        """
+        found = self._only_one(size, key, folder, False) if any(key) else None
+        return self._only_one(size, key, folder, True) if found is None and loosely else found
+
+    def _only_one(
+        self, size: tuple[int, int], key: tuple[str, ...], folder: str, loosely: bool
+    ) -> GuessedCamera | None:
+        asked = size, key, loosely
+        if asked not in self._alike:
             fitting = {name: one for name, one in self._cameras.items() if (one.width, one.height) == size}
-            self._alike[size] = {name: camera_text(one) for name, one in fitting.items()}
-        return self._alike[size]
+            self._alike[asked] = {
+                name: camera_text(one) for name, one in fitting.items() if self._is(name, key, loosely)
+            }
+        alike = self._alike[asked]
+        if len({*alike.values()}) > 1:
+            alike = {name: text for name, text in alike.items() if folder in self._folders.get(name, ())}
+        if len({*alike.values()}) != 1:
+            return None
+        return GuessedCamera(self._cameras[next(iter(alike))], "that of the map's camera")
+
+    def _is(self, sensor: str, key: tuple[str, ...], loosely: bool) -> bool:
+        """Tell whether EXIF says that a sensor took an image; loosely, that it does not say the opposite."""
+        if loosely and not any(key):
+            return True
+        if sensor not in self._keys:
+            self._keys[sensor] = _exif_key_of(self._images.get(sensor))
+        own = self._keys[sensor]
+        return all(one == other or (loosely and not (one and other)) for one, other in zip(own, key, strict=True))
 
     @cached_property
-    def _images(self) -> dict[str, Path]:
-        """An image of each sensor."""
-        first = self._session.images.drop_duplicates("sensor_id")["sensor_id"]
-        return {name: self._session.image_path(row) for row, name in first.items()}
-
-    def with_exif(self, sensors: Mapping[str, str], key: tuple[str, ...]) -> dict[str, str]:
-        """Return those of which an image has this camera and focal length in EXIF, see `exif_key`."""
-        images = self._images
-        return {name: text for name, text in sensors.items() if name in images and _exif_key_of(images[name]) == key}
-
-    def only_one(self, sensors: Mapping[str, str], folder: str) -> GuessedCamera | None:
-        """Return the intrinsics that all sensors have, or all with images in a folder of this name; None if they
-        differ.
-        """
-        if len({*sensors.values()}) > 1:
-            sensors = {name: text for name, text in sensors.items() if self._folder(name) == folder}
-        if len({*sensors.values()}) != 1:
-            return None
-        return GuessedCamera(self._cameras[next(iter(sensors))], "that of the map's camera")
-
-    def _folder(self, sensor: str) -> str:
-        return self._images[sensor].parent.name if sensor in self._images else ""
+    def _folders(self) -> dict[str, set[str]]:
+        """Names of the folders with images of each sensor."""
+        names = self._session.images["path"].astype(str).str.rpartition("/")[0].str.rpartition("/")[2]
+        listed = names.groupby(self._session.images["sensor_id"].astype(str)).unique()
+        return {str(sensor): set(found) for sensor, found in listed.items()}
 
 
-@lru_cache(MAX_MAP_CAMERAS)
-def _exif_key_of(path: Path) -> tuple[str, ...]:
+def _exif_key_of(path: Path | None) -> tuple[str, ...]:
     try:
-        return exif_key(read_header(path)[1])
+        return exif_key({} if path is None else read_header(path)[1])
     except ImageError:
-        return ()
+        return exif_key({})
 
 
 def known_camera(image: Image, cameras: MapCameras | None = None) -> GuessedCamera:
     """Return the camera of an image without intrinsics: that of the map's camera that took it, or one from EXIF.
 
-    A camera of the map is known better than EXIF knows one. It took the image if one of its images has the same size,
-    make, model and focal length in EXIF; of several such, that of a folder of the same name. For an image without a
-    focal length, an equal size is enough.
+    A camera of the map is known better than EXIF knows one. It took the image if its first image has the same size,
+    make, model and focal length in EXIF; of several such, that of a folder of the same name. For an image whose EXIF
+    does not give a focal length in pixels, an equal size is enough if EXIF does not contradict.
 
     Args:
         image: file or pixels.
@@ -197,22 +213,23 @@ def known_camera(image: Image, cameras: MapCameras | None = None) -> GuessedCame
     Raises:
         ImageError: the image cannot be read, or its camera is not known.
     """
+    guess: GuessedCamera | ImageError = ImageError("pixels have no EXIF: give the intrinsics")
     if isinstance(image, str | Path):
         (size, exif), folder = read_header(Path(image)), Path(image).parent.name
+        try:
+            guess = exif_camera(Path(image))
+        except ImageError as error:
+            guess = error
     else:
         height, width = pixels_from(image).shape[:2]
         size, exif, folder = (width, height), dict[int, Any](), ""
-    alike, key = ({} if cameras is None else cameras.of_size(size)), exif_key(exif)
-    if cameras and alike and any(key) and (found := cameras.only_one(cameras.with_exif(alike, key), folder)):
-        return found
-    try:
-        if isinstance(image, str | Path):
-            return exif_camera(Path(image))
-        raise ImageError("pixels have no EXIF: give the intrinsics")
-    except ImageError:
-        if cameras and (found := cameras.only_one(alike, folder)):
-            return found
-        raise
+    unknown = isinstance(guess, ImageError)
+    found = None if cameras is None else cameras.find(size, exif_key(exif), folder, unknown)
+    if isinstance(guess, GuessedCamera):
+        return guess if found is None else found._replace(cropped=guess.cropped)
+    if found is None:
+        raise guess
+    return found
 
 
 def guessed_camera(image: Image, cameras: MapCameras | None = None) -> GuessedCamera:
@@ -231,9 +248,9 @@ def guessed_camera(image: Image, cameras: MapCameras | None = None) -> GuessedCa
 
 
 def camera_key(image: Image, camera: pycolmap.Camera) -> tuple[Any, ...]:
-    """Return what images of one camera have in common: size, and what EXIF says of the camera."""
+    """Return what images of one camera have in common: the first guess of it, and what EXIF says of it."""
     exif = read_header(Path(image))[1] if isinstance(image, str | Path) else {}
-    return camera.width, camera.height, *exif_key(exif)
+    return camera_text(camera), *exif_key(exif)
 
 
 def with_focal(camera: pycolmap.Camera, focal_px: float) -> pycolmap.Camera:
