@@ -18,6 +18,7 @@ from toolkit.capture.images import exif_camera, read_image, read_number
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.interchange import import_colmap, import_images
 from toolkit.geometry import invert, make_pose, pose_from_qt, qt_from_pose, quaternion_to_rotation
+from toolkit.scene.query import MapCameras, known_camera
 
 SIZE = (64, 48)
 CAMERA = "PINHOLE, 64, 48, 50, 51, 32, 24"
@@ -439,9 +440,7 @@ def test_names_that_fit_two_files_are_not_guessed(tmp_path: Path) -> None:
     assert report.images.set_index("image")["status"].to_dict() == {"Img.jpg": "no such file", "good.jpg": "imported"}
 
 
-def test_files_that_are_not_photographs_are_said(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_that_are_not_photographs_are_said(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     for name in ("x.heic", "y.HEIC", "z.gif"):
         (folder / name).write_bytes(b"anything")
@@ -602,6 +601,25 @@ def test_queries_without_intrinsics_are_of_the_camera_of_the_map_that_took_them(
     )
     assert found["left/9.jpg"] == [50, 50, 31, 25]
     assert images["status"][["other/9.jpg", "small/9.jpg"]].str.startswith("no focal length in EXIF").all()
+
+
+def test_two_estimates_of_one_camera_are_one_and_a_sensor_without_images_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a map that grew has them: then no query without EXIF could be imported."""
+    rows = ["image,qw,qx,qy,qz,tx,ty,tz,model,width,height,params"]
+    for number, focal in enumerate([50.0, 50.2]):
+        name = save(tmp_path / f"map/{number}/1.jpg").relative_to(tmp_path / "map")
+        rows.append(f"{name},1,0,0,0,{number},0,0,PINHOLE,64,48,{focal} {focal} 31 25")
+    (tmp_path / "map.csv").write_text("\n".join(rows) + "\n")
+    import_images(tmp_path / "map", tmp_path / "PLACE", split="map", table=tmp_path / "map.csv")
+    with (tmp_path / "PLACE/sessions/ios_map/sensors.txt").open("a") as stream:
+        stream.write("unused, , camera, PINHOLE, 64, 48, 90, 90, 31, 25\n")
+    monkeypatch.chdir(save(tmp_path / "queries/9.jpg").parent)
+    report = import_images(Path(), tmp_path / "PLACE")
+    assert report.record["cameras"][0]["focal_px"] == [50.0]
+    mapped = MapCameras(Capture.open(tmp_path / "PLACE")["ios_map"])
+    assert known_camera("9.jpg", mapped).camera.mean_focal_length() == 50.0
 
 
 def test_an_image_of_absurd_size_is_a_row(folder: Path, tmp_path: Path) -> None:

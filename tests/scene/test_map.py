@@ -188,7 +188,7 @@ class OfOneCamera:
     """A map in which images (H, W) of value 1 tell that the true focal length is 500 px, those of value 0 nothing, and
     those of value 2 only that it is no small one."""
 
-    session = SimpleNamespace(sensors=pd.DataFrame({"sensor_type": [], "sensor_id": []}))
+    session = SimpleNamespace(images=pd.DataFrame({"sensor_id": []}), camera_rows=[])
 
     def query(self, image: Any, camera: pycolmap.Camera, *_: Any) -> Query:
         return Query([View("image", image, camera, False)], np.eye(4)[None])

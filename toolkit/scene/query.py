@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 _MAX_DEVIATION = 1e-3
 """Largest deviation of R @ R.T from the identity for a rotation R; rounding to float32 or in files stays below."""
 MAX_MAP_CAMERAS = 1000  # cameras of the map among which that of an image is looked for, at most
+SAME_CAMERA = 5e-3  # difference of two estimates of a parameter: relative, or of a coefficient of distortion
 FOCAL_PRIOR = 1.2  # focal length of a camera that nothing is known of, in multiples of the longer side
 Image = Any
 """A file (str, Path), or pixels as `pixels_from` takes them."""
@@ -138,8 +139,7 @@ class MapCameras:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        sensors = session.sensors
-        ids = sensors.loc[sensors["sensor_type"] == "camera", "sensor_id"].head(MAX_MAP_CAMERAS)
+        ids = session.images["sensor_id"].iloc[session.camera_rows].drop_duplicates().head(MAX_MAP_CAMERAS)
         self._cameras = {str(name): session.camera(str(name)) for name in ids}
         self._alike = dict[tuple[int, int], dict[str, str]]()
 
@@ -159,20 +159,22 @@ class MapCameras:
     def with_exif(self, sensors: Mapping[str, str], key: tuple[str, ...]) -> dict[str, str]:
         """Return those of which an image has this camera and focal length in EXIF, see `exif_key`."""
         images = self._images
-        return {name: text for name, text in sensors.items() if name in images and _exif_key_of(images[name]) == key}
+        return {name: text for name, text in sensors.items() if _exif_key_of(images[name]) == key}
 
     def only_one(self, sensors: Mapping[str, str], folder: str) -> GuessedCamera | None:
         """Return the intrinsics that all sensors have, or all with images in a folder of this name; None if they
-        differ.
+        differ. If they differ as two estimates of one camera do, they are those of the map's first images.
         """
         if len({*sensors.values()}) > 1:
-            sensors = {name: text for name, text in sensors.items() if self._folder(name) == folder}
-        if len({*sensors.values()}) != 1:
+            sensors = {name: text for name, text in sensors.items() if self._folder(name) == folder} or sensors
+        cameras = [self._cameras[name] for name in sensors]
+        if not cameras or any(one.model != cameras[0].model for one in cameras):
             return None
-        return GuessedCamera(self._cameras[next(iter(sensors))], "that of the map's camera")
+        alike = (np.allclose(one.params, cameras[0].params, SAME_CAMERA, SAME_CAMERA) for one in cameras)
+        return GuessedCamera(cameras[0], "that of the map's camera") if all(alike) else None
 
     def _folder(self, sensor: str) -> str:
-        return self._images[sensor].parent.name if sensor in self._images else ""
+        return self._images[sensor].parent.name
 
 
 @lru_cache(MAX_MAP_CAMERAS)
