@@ -710,29 +710,31 @@ def add_recording(
 
 
 def remove_recording(name: str, capture: str | Path, device: str = "ios") -> str:
-    """Remove the images whose names start with a recording's name from the map session; return what was done, in words.
+    """Remove the images of a recording, or one image, by name from the map session; return what was done, in words.
 
     Raise CaptureError if the session was not reconstructed, no image has such a name, or all have.
     """
     folder, session = Path(capture) / FOLDER, Path(capture) / "sessions" / f"{device}_map"
     model, opened = _model(folder, session), Session.open(session)
-    gone = {one for one in opened.image_names if own_name(one).startswith(f"{name}/")}
+    gone = {one for one in opened.image_names if f"{own_name(one)}/".startswith(f"{name}/")}
     if not 0 < len(gone) < len(opened.image_names):
         recordings = sorted({own_name(one).partition("/")[0] for one in opened.image_names if "/" in own_name(one)})
         found = f"{len(gone)} of {len(opened.image_names)} images of recording {name!r}"
         raise CaptureError(f"{session}: found {found}. Recordings: {', '.join(recordings) or 'one, without a name'}.")
-    keys = {(str(row["timestamp"]), row["sensor_id"]) for row, one in
-            zip(opened.images.to_dict("records"), opened.image_names, strict=True) if one in gone}  # fmt: skip
+    rows_of_images = [*zip(opened.images.to_dict("records"), opened.image_names, strict=True)]
+    keys = {(str(row["timestamp"]), row["sensor_id"]) for row, one in rows_of_images if one in gone}
+    kept_sensors = {row["sensor_id"] for row, one in rows_of_images if one not in gone}
+    keys |= {(sensor, "") for _, sensor in keys if sensor not in kept_sensors}  # id and name in sensors.txt
     with write_folder(session, replace=True, keep=True) as changed:
-        for path in (changed / "images.txt", changed / "trajectories.txt"):
+        for path in (changed / "images.txt", changed / "trajectories.txt", changed / "sensors.txt"):
             rows = ((line, line.split(",")) for line in path.read_text(encoding="utf-8").splitlines())
             kept = [line for line, cells in rows if line.startswith("#") or (*map(str.strip, cells[:2]),) not in keys]
             write_table(path, None, kept)
-        for one in gone:
-            (changed / RAW_DATA / one.partition(f"/{RAW_DATA}/")[2]).unlink(missing_ok=True)
+        for old in (f"{RAW_DATA}/{IMPORTED}{name}", f"{MASKS}/{IMPORTED}{name}", f"{MASKS}/{IMPORTED}{name}.png"):
+            (shutil.rmtree if (changed / old).is_dir() else Path.unlink)(changed / old, True)
         table = pd.read_csv(changed / "proc" / "import.csv", dtype=str, keep_default_na=False)
         with write_atomic(changed / "proc" / "import.csv") as temporary:
-            table[~table["image"].str.startswith(f"{name}/")].to_csv(temporary, index=False)
+            table[~(table["image"] + "/").str.startswith(f"{name}/")].to_csv(temporary, index=False)
         if is_linked_here(session):
             note_linked_here(changed)
     for image in [image for image in model.images.values() if image.name in gone and image.has_pose]:
