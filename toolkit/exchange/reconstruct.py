@@ -257,9 +257,7 @@ class _Work:
         priors = []
         for image in np.flatnonzero(np.isfinite(self.prior).all(axis=(1, 2))).tolist():
             number, camera_id = self.image_ids[image], self.camera_ids[self.camera_of[image]]
-            prior = pycolmap.PosePrior(
-                position=self.prior[image, :3, 3], position_covariance=noise_m**2 * np.eye(3)
-            )
+            prior = pycolmap.PosePrior(position=self.prior[image, :3, 3], position_covariance=noise_m**2 * np.eye(3))
             prior.pose_prior_id, prior.coordinate_system = number, pycolmap.PosePriorCoordinateSystem.CARTESIAN
             prior.corr_data_id = pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id), number)
             priors.append(prior)
@@ -476,8 +474,9 @@ def reconstruct(
             given = parse_camera("camera", camera)
         except ValueError as error:
             raise ManifestError(f"camera: {error}") from None
-    if not items:
-        raise CaptureError(f"{sources[0]}: no photograph can be read. First: {next(iter(unreadable.items()))}")
+    if len(items) < MIN_MODEL:
+        why = "".join(f" {name}: {reason}." for name, reason in [*unreadable.items()][:1])
+        raise CaptureError(f"{sources[0]}: {len(items)} photographs can be read, expected {MIN_MODEL} or more.{why}")
     cameras = dict.fromkeys((item.name for item in items), given) if given is not None else {}
     tabled = _of_items(read_intrinsics(Path(table)), items, table) if table is not None else {}
     cameras |= tabled
@@ -533,7 +532,7 @@ def reconstruct(
                     f"reprojection error {error_px:.2f} px", *notes]  # fmt: skip
     if sizes[1:]:
         where = ", ".join(f"{size} in {path}" for size, path in zip(sizes[1:], paths[1:], strict=True))
-        draft.notes.append(f"not connected to it, so not used: models of {where}")
+        draft.notes.append(f"not connected to it, so not used: models of {where}; IMAGES: {folder / 'sessions'}")
     if work.exif_px and not work.exif_used:
         count = sum(number in work.exif_px for number in work.camera_of)
         draft.notes.append(f"the focal length in EXIF of {count} photographs is not used, as no model fits it")
