@@ -11,6 +11,7 @@ import pycolmap
 import pytest
 from typer.testing import CliRunner
 
+from toolkit import pipeline
 from toolkit.__main__ import app
 from toolkit.capture import Capture
 from toolkit.capture.images import camera_text
@@ -393,6 +394,32 @@ def test_frames_of_a_video_move_and_are_sharp(tmp_path: Path) -> None:
     found, unreadable = gather([tmp_path], tmp_path / "PLACE/reconstruction/images", 1)
     assert [item.name for item in found] == names
     assert "no frame can be read" in unreadable["torn.mp4"]
+
+
+def test_a_killed_command_goes_on_from_its_model(
+    photographs: Path, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It asked for other photographs, and no manifest was there."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(place / module.FOLDER, tmp_path / "PLACE" / module.FOLDER, symlinks=True)
+    ran = list[Any]()
+
+    def kill(*arguments: Any, **_: Any) -> Path:
+        ran.append(arguments)
+        if len(ran) == 1:
+            raise KeyboardInterrupt
+        return tmp_path
+
+    monkeypatch.setattr(pipeline, "run", kill)
+    command = ["reconstruct", str(photographs), "PLACE"]
+    assert CliRunner().invoke(app, command).exit_code != 0
+    before = (tmp_path / "PLACE/sessions/ios_map/trajectories.txt").stat().st_mtime_ns
+    done = CliRunner().invoke(app, command)
+    assert "from the same photographs, kept" in done.stdout
+    assert len(ran) == 2
+    assert (tmp_path / "PLACE/sessions/ios_map/trajectories.txt").stat().st_mtime_ns == before
+    for other in (["--fps", "3"], ["--hold-out", "2"]):
+        assert CliRunner().invoke(app, [*command, *other]).exit_code != 0
 
 
 def test_the_command_line_explains_what_is_missing(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ from toolkit.capture.images import camera_text, default_workers, exif_key, prefe
 from toolkit.capture.names import is_linked_here, note_linked_here
 from toolkit.capture.tables import write_table
 from toolkit.embedders.vlad import Vlad
-from toolkit.errors import CaptureError, ManifestError, WeightsError
+from toolkit.errors import COMMAND, CaptureError, ManifestError, WeightsError
 from toolkit.exchange.colmap_model import inverse
 from toolkit.exchange.drafts import AXES, SUBSESSION, Draft, DraftImage, every_nth, list_images, start
 from toolkit.exchange.georeference import RECORD, place, read_positions
@@ -586,14 +586,21 @@ def reconstruct_once(
         ManifestError: as for `reconstruct`.
     """
     source = Path(photographs)
-    names = [""] if source.is_file() else list_images(source, TAKEN_SUFFIXES)
-    inputs = {"photographs": str(source.resolve()), "hold_out": hold_out, "camera": camera}
-    inputs["files of photographs"] = files_fingerprint([source / name for name in names])
+    inputs = inputs_of([source], hold_out=hold_out, camera=camera)
     session = Path(capture) / "sessions" / f"{device}_map"
     return once(
         session, inputs,
         lambda record: reconstruct([source], capture, device, camera=camera, hold_out=hold_out, record=record).report,
     )  # fmt: skip
+
+
+def inputs_of(sources: Sequence[Path], **options: Any) -> dict[str, Any]:
+    """Return what a reconstruction is made from, as `proc/import.json` has it."""
+    names = [list_images(source, TAKEN_SUFFIXES) if source.is_dir() else [""] for source in sources]
+    paths = [source / name for source, inside in zip(sources, names, strict=True) for name in inside]
+    told = {name: one if one is None or isinstance(one, int | float) else str(one) for name, one in options.items()}
+    places = ", ".join(str(source.resolve()) for source in sources)
+    return {"photographs": places, **told, "files of photographs": files_fingerprint(paths)}
 
 
 def _escalate(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> list[str]:
@@ -682,7 +689,8 @@ def add_recording(
     new = [item for item in gathered if item.path.resolve() not in known]
     names = {item.name for item in old.values()}
     if not new or any(item.name in names for item in new):
-        raise CaptureError(f"{sources[0]}: its photographs, or others of these names, are in {session} already.")
+        do = f"To finish a map whose making was stopped: {COMMAND} run MANIFEST --only map."
+        raise CaptureError(f"{sources[0]}: its photographs, or others of these names, are in {session} already. {do}")
     work = _Work(folder, device, [*old.values(), *new], {})
     _keep_cameras(work, base, {item.name: number for number, item in old.items()})
     work.extract(LocalMethod("sift", SiftExtractor(), _Mutual(RATIO, shorten=KINDS["sift"].shorten)), range(len(work)))
