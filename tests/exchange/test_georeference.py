@@ -12,6 +12,7 @@ from toolkit.exchange.georeference import (
     GPS,
     WORLD_DEVIATION,
     Placing,
+    alignment,
     drift_factor,
     east_north_up,
     fit,
@@ -122,6 +123,16 @@ def test_too_few_or_too_close_positions_give_no_meters() -> None:
     result = placed(synthetic(), {}, positions=noise)
     assert result.unit is None
     assert re.search(r"scale known to \d+ %", result.notes[0])
+
+
+def test_images_of_a_capture_have_their_names() -> None:
+    """As those of a second model that `reconstruct` found, which `import colmap` takes: "no photograph has GPS"."""
+    true = {image.name: image.cam_from_world().inverse().matrix() for image in synthetic().images.values()}
+    poses = {f"ios_map/raw_data/import/images/{name}": np.vstack([pose, [0, 0, 0, 1]]) for name, pose in true.items()}
+    positions = {name: SCALE * pose[:3, 3] for name, pose in poses.items()}
+    result, new_from_old = alignment(poses, {}, {}, positions)
+    assert result.unit == "m"
+    assert new_from_old.scale == pytest.approx(SCALE)
 
 
 def test_noise_of_positions_is_that_of_the_place() -> None:

@@ -16,7 +16,7 @@ from toolkit.capture.session import IMPORT_RECORD
 from toolkit.capture.upright import up_of_cameras
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.recordings import numbers_in, read_csv
-from toolkit.files import own_name, read_json
+from toolkit.files import IMPORTED, own_name, read_json
 from toolkit.geometry import Floats, invert, make_pose
 
 MAX_ERRORS_M = (0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
@@ -153,7 +153,7 @@ def alignment(
     for number, (name, world_from_cam) in enumerate(world_from_cams.items(), start=1):
         camera = pycolmap.Camera(camera_id=number, model="SIMPLE_PINHOLE", width=2, height=2, params=[1, 1, 1])
         model.add_camera_with_trivial_rig(camera)
-        image = pycolmap.Image(name, camera_id=number, image_id=number)
+        image = pycolmap.Image(f"{IMPORTED}{name}", camera_id=number, image_id=number)  # `place` wants the user's name
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(invert(world_from_cam)[:3]))
     before = np.vstack([np.zeros(3), np.eye(3)])
     corners = [model.add_point3D(corner, pycolmap.Track()) for corner in before]
