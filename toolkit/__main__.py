@@ -549,9 +549,11 @@ def reconstruct(
     """
     from toolkit import pipeline
     from toolkit.capture import Capture
+    from toolkit.capture.session import IMPORT_RECORD
     from toolkit.exchange.import_report import new_manifest
-    from toolkit.exchange.reconstruct import FOLDER, add_recording, reconstruct, remove_recording
+    from toolkit.exchange.reconstruct import FOLDER, add_recording, inputs_of, reconstruct, remove_recording
     from toolkit.figures.explore import draw_top_view
+    from toolkit.files import read_json
 
     if (len(sources) != 1) if remove else (len(sources) < 2):
         raise ManifestError("reconstruct: expected photographs and then the folder of the new capture.")
@@ -559,18 +561,24 @@ def reconstruct(
     manifest = _manifest_of(capture)
     tell = partial(print, file=sys.stderr) if as_json else print
     points, option, report = dict[str, Any](), "", None
+    session = capture / "sessions" / f"{device}_map"
+    made = read_json(session / IMPORT_RECORD)
+    first = {"hold_out": hold_out, "camera": camera, "table": table, "distance": distance, "positions": positions,
+             "poses_prior": poses_prior, "rig": rig, "masks": masks}  # fmt: skip
+    inputs = {} if remove else inputs_of(photos, **first, fps=fps, axes=axes, mapper=mapper)
     if remove:
         tell(remove_recording(remove, capture, device))
-    elif (capture / "sessions" / f"{device}_map").exists() and not replace:
-        first = {"hold-out": hold_out, "camera": camera, "table": table, "distance": distance, "positions": positions,
-                 "poses-prior": poses_prior, "rig": rig, "masks": masks}  # fmt: skip
-        if given := next((name for name, value in first.items() if value), None):
+    elif not replace and made.get("input") == inputs and "before" not in made:  # else those left out may fit now
+        tell(f"{session}: reconstructed before from the same photographs, kept")
+    elif session.exists() and not replace:
+        if given := next((name for name, value in first.items() if value), "").replace("_", "-"):
             raise ManifestError(f"--{given} is for a new map. {capture} has one, to which the photographs are added.")
         report = add_recording(photos, capture, device, fps)
     else:
         result = reconstruct(
             photos, capture, device, fps, camera, distance, mapper, table, poses_prior, rig,
             hold_out=hold_out, positions=positions, placing=placing, masks=masks, axes=axes, replace=replace,
+            record={"input": inputs},
         )  # fmt: skip
         report, option = result.report, result.camera
         points = {"points": result.points, "colors": result.colors}

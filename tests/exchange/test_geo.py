@@ -18,7 +18,14 @@ from toolkit.__main__ import app
 from toolkit.capture import Capture
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.export import export_exif, export_geo, geo_table
-from toolkit.exchange.georeference import GEO_COLUMNS, east_north_up, geographic, geographic_poses, origin_of
+from toolkit.exchange.georeference import (
+    GEO_COLUMNS,
+    WORLD_DEVIATION,
+    east_north_up,
+    geographic,
+    geographic_poses,
+    origin_of,
+)
 from toolkit.exchange.photographs import gather
 from toolkit.geometry import Floats, make_pose
 from toolkit.localize import localize_pairs
@@ -109,6 +116,10 @@ def test_tables_have_a_row_for_every_image(localized: Path, placed: Path, tmp_pa
     assert row["heading_deg"] == pytest.approx(np.degrees(np.arctan2(axis[0], axis[1])) % 360, abs=1e-3)
     count = export_geo(localized, tmp_path / "q.csv", placed)
     assert count == len(known)
+    record = placed / "sessions/ios_map/proc/import.json"
+    record.write_text(json.dumps({**json.loads(record.read_text()), WORLD_DEVIATION: 3.0}))
+    unsure = geo_table(localized, placed)["position_std_m"]
+    assert np.allclose(unsure, np.hypot(table["position_std_m"], 3.0), equal_nan=True)
     assert pd.read_csv(tmp_path / "q.csv")["heading_deg"].notna().sum() == count
     assert export_geo(localized, tmp_path / "q.geojson", placed) == count
     features = json.loads((tmp_path / "q.geojson").read_text())["features"]

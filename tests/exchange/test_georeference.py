@@ -1,5 +1,6 @@
 """Models made level and metric: GPS, known positions, a measured distance, and what is refused."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,17 @@ import pycolmap
 import pytest
 
 from toolkit.errors import CaptureError, ManifestError
-from toolkit.exchange.georeference import GPS, Placing, drift_factor, east_north_up, fit, place, read_positions
+from toolkit.exchange.georeference import (
+    GPS,
+    WORLD_DEVIATION,
+    Placing,
+    alignment,
+    drift_factor,
+    east_north_up,
+    fit,
+    place,
+    read_positions,
+)
 from toolkit.geometry import Floats, quaternion_to_rotation, unit
 
 SCALE = 3.7  # meters per unit of the models
@@ -109,7 +120,31 @@ def test_too_few_or_too_close_positions_give_no_meters() -> None:
     assert placed(model, two).unit is None
     rng = np.random.default_rng(0)
     noise = {name: rng.normal(size=3) * 3 for name in centers(model)}
-    assert placed(synthetic(), {}, positions=noise).unit is None
+    result = placed(synthetic(), {}, positions=noise)
+    assert result.unit is None
+    assert re.search(r"scale known to \d+ %", result.notes[0])
+
+
+def test_images_of_a_capture_have_their_names() -> None:
+    """As those of a second model that `reconstruct` found, which `import colmap` takes: "no photograph has GPS"."""
+    true = {image.name: image.cam_from_world().inverse().matrix() for image in synthetic().images.values()}
+    poses = {f"ios_map/raw_data/import/images/{name}": np.vstack([pose, [0, 0, 0, 1]]) for name, pose in true.items()}
+    positions = {name: SCALE * pose[:3, 3] for name, pose in poses.items()}
+    result, new_from_old = alignment(poses, {}, {}, positions)
+    assert result.unit == "m"
+    assert new_from_old.scale == pytest.approx(SCALE)
+
+
+def test_noise_of_positions_is_that_of_the_place() -> None:
+    model, errors = synthetic(), []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        true = {name: SCALE * 20 * center for name, center in centers(model).items()}
+        result = placed(model, {}, positions={name: at + rng.normal(size=3) for name, at in true.items()})
+        middle = [np.mean([*found.values()], axis=0) for found in (centers(model), true)]
+        errors.append(np.linalg.norm(middle[0][:2] - middle[1][:2]) / result.record[WORLD_DEVIATION])
+        model = synthetic()
+    assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 2
 
 
 def test_drift_of_rough_poses_is_no_independent_noise() -> None:

@@ -19,7 +19,7 @@ from toolkit.features.features import SiftExtractor
 from toolkit.features.stores import extract_session
 from toolkit.files import read_json
 
-TABLES = ("images.txt", "trajectories.txt")
+TABLES = ("images.txt", "trajectories.txt", "sensors.txt")
 
 
 pytestmark = pytest.mark.slow  # each reconstructs
@@ -82,8 +82,26 @@ def test_new_photographs_are_registered_and_the_others_stay(
         remove_recording("mor", first)
     assert remove_recording("more", first).startswith("2 images of more removed")
     assert {name: (session / name).read_text() for name in TABLES} == before
-    assert not list((session / "raw_data").rglob("more/*"))
+    assert not [*session.rglob("more")]
     assert add_recording([folders / "more"], first).record["used"] == 2
+
+
+def test_a_file_is_a_recording_with_its_mask(folders: Path, tmp_path: Path) -> None:
+    place = tmp_path / "PLACE"
+    reconstruct([folders / "first"], place)
+    session, (file, other) = place / "sessions" / "ios_map", sorted((folders / "more").iterdir())
+    before = {name: (session / name).read_text() for name in TABLES}
+    mask = tmp_path / "taken/masks" / f"{file.name}.png"
+    mask.parent.mkdir(parents=True)
+    shutil.copy(file, tmp_path / "taken")
+    PIL.Image.new("L", PIL.Image.open(file).size, 255).save(mask)
+    assert add_recording([tmp_path / "taken" / file.name, other], place).record["used"] == 2
+    assert len([*session.rglob(mask.name)]) == 1
+    for name in (file.name, other.name):
+        assert remove_recording(name, place).startswith(f"1 images of {name} removed")
+    assert {name: (session / name).read_text() for name in TABLES} == before
+    assert not [*session.rglob(f"{file.name}*")]
+    assert check_capture(place).ok
 
 
 def test_a_killed_addition_is_repeated(folders: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

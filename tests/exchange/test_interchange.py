@@ -18,6 +18,7 @@ from toolkit.capture.images import exif_camera, read_image, read_number
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.interchange import import_colmap, import_images
 from toolkit.geometry import invert, make_pose, pose_from_qt, qt_from_pose, quaternion_to_rotation
+from toolkit.scene.query import MapCameras, known_camera
 
 SIZE = (64, 48)
 CAMERA = "PINHOLE, 64, 48, 50, 51, 32, 24"
@@ -642,6 +643,25 @@ def test_queries_are_imported_beside_a_map_that_cannot_be_read(tmp_path: Path, t
     report = import_images(tmp_path / "queries", tmp_path / "PLACE")
     assert report.images["status"].tolist() == ["imported"]
     assert any(note.startswith("ios_map cannot be read") and torn in note for note in report.record["notes"])
+
+
+def test_two_estimates_of_one_camera_are_one_and_a_sensor_without_images_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a map that grew has them: then no query without EXIF could be imported."""
+    rows = ["image,qw,qx,qy,qz,tx,ty,tz,model,width,height,params"]
+    for number, focal in enumerate([50.0, 50.2]):
+        name = save(tmp_path / f"map/{number}/1.jpg").relative_to(tmp_path / "map")
+        rows.append(f"{name},1,0,0,0,{number},0,0,PINHOLE,64,48,{focal} {focal} 31 25")
+    (tmp_path / "map.csv").write_text("\n".join(rows) + "\n")
+    import_images(tmp_path / "map", tmp_path / "PLACE", split="map", table=tmp_path / "map.csv")
+    with (tmp_path / "PLACE/sessions/ios_map/sensors.txt").open("a") as stream:
+        stream.write("unused, , camera, PINHOLE, 64, 48, 90, 90, 31, 25\n")
+    monkeypatch.chdir(save(tmp_path / "queries/9.jpg").parent)
+    report = import_images(Path(), tmp_path / "PLACE")
+    assert report.record["cameras"][0]["focal_px"] == [50.0]
+    mapped = MapCameras(Capture.open(tmp_path / "PLACE")["ios_map"])
+    assert known_camera("9.jpg", mapped).camera.mean_focal_length() == 50.0
 
 
 def test_an_image_of_absurd_size_is_a_row(folder: Path, tmp_path: Path) -> None:

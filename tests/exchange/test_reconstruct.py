@@ -11,11 +11,13 @@ import pycolmap
 import pytest
 from typer.testing import CliRunner
 
+from toolkit import pipeline
 from toolkit.__main__ import app
 from toolkit.capture import Capture
 from toolkit.capture.images import camera_text
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange import reconstruct as module
+from toolkit.exchange.interchange import import_colmap
 from toolkit.exchange.photographs import choose_frames, gather, initial_cameras
 from toolkit.exchange.reconstruct import add_recording, reconstruct
 from toolkit.features.features import SiftExtractor
@@ -224,6 +226,10 @@ def test_two_places_are_two_models(photographs: Path, tmp_path: Path) -> None:
     assert (record["registered"], record["other models"]) == (6, [4])
     left = result.report.images.set_index("image")["status"]
     assert "in model 1, of 4 photographs" in left["other/002.png"]
+    models = tmp_path / "PLACE/reconstruction/models/1"
+    assert f"models of 4 in {models}; IMAGES: {tmp_path / 'PLACE/reconstruction/sessions'}" in result.report.text()
+    other_place = import_colmap(models, tmp_path / "PLACE/reconstruction/sessions", tmp_path / "OTHER")
+    assert other_place.record["used"] == 4
 
 
 def test_the_capture_is_in_the_folder_of_the_photographs(tmp_path: Path) -> None:
@@ -240,6 +246,10 @@ def test_nothing_fits(tmp_path: Path) -> None:
     for number in range(3):
         PIL.Image.fromarray(rng.integers(0, 255, (240, 320, 3), np.uint8)).save(photographs / f"{number}.png")
     with pytest.raises(CaptureError, match="fit together"):
+        reconstruct([photographs], tmp_path / "PLACE")
+    (photographs / "0.png").unlink()
+    (photographs / "1.png").write_bytes(b"no image")
+    with pytest.raises(CaptureError, match=r"1 photographs can be read, expected 3 or more\. 1\.png: cannot be read"):
         reconstruct([photographs], tmp_path / "PLACE")
     assert not (tmp_path / "PLACE/sessions").exists()
 
@@ -381,6 +391,35 @@ def test_frames_of_a_video_move_and_are_sharp(tmp_path: Path) -> None:
     (tmp_path / "torn.mp4").write_bytes(b"no video")
     with pytest.raises(CaptureError, match=r"torn\.mp4"):
         list(choose_frames(tmp_path / "torn.mp4"))
+    found, unreadable = gather([tmp_path], tmp_path / "PLACE/reconstruction/images", 1)
+    assert [item.name for item in found] == names
+    assert "no frame can be read" in unreadable["torn.mp4"]
+
+
+def test_a_killed_command_goes_on_from_its_model(
+    photographs: Path, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It asked for other photographs, and no manifest was there."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(place / module.FOLDER, tmp_path / "PLACE" / module.FOLDER, symlinks=True)
+    ran = list[Any]()
+
+    def kill(*arguments: Any, **_: Any) -> Path:
+        ran.append(arguments)
+        if len(ran) == 1:
+            raise KeyboardInterrupt
+        return tmp_path
+
+    monkeypatch.setattr(pipeline, "run", kill)
+    command = ["reconstruct", str(photographs), "PLACE"]
+    assert CliRunner().invoke(app, command).exit_code != 0
+    before = (tmp_path / "PLACE/sessions/ios_map/trajectories.txt").stat().st_mtime_ns
+    done = CliRunner().invoke(app, command)
+    assert "from the same photographs, kept" in done.stdout
+    assert len(ran) == 2
+    assert (tmp_path / "PLACE/sessions/ios_map/trajectories.txt").stat().st_mtime_ns == before
+    for other in (["--fps", "3"], ["--hold-out", "2"]):
+        assert CliRunner().invoke(app, [*command, *other]).exit_code != 0
 
 
 def test_the_command_line_explains_what_is_missing(tmp_path: Path) -> None:

@@ -251,7 +251,11 @@ def test_a_cropped_image_is_ok_only_if_the_matches_tell_its_principal_point(
         sensors = pd.DataFrame({"sensor_type": ["camera"], "sensor_id": ["cam"]})
         images = pd.DataFrame({"sensor_id": ["cam"], "path": ["a.jpg"]})
         session: Any = SimpleNamespace(
-            sensors=sensors, images=images, camera=lambda _: camera, image_path=lambda _: tmp_path / "a.jpg"
+            camera_rows=[0],
+            sensors=sensors,
+            images=images,
+            camera=lambda _: camera,
+            image_path=lambda _: tmp_path / "a.jpg",
         )
         scene_map.cameras = MapCameras(session)
     (result,) = localize_images(scene_map, [tmp_path / "a.jpg"])  # type: ignore[arg-type]

@@ -1,6 +1,7 @@
 """A run in the hand."""
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +95,18 @@ def test_a_map_by_itself_localizes_as_a_run_with_queries(small_capture: Path, tm
     np.testing.assert_allclose(poses, pair.poses[rows], atol=1e-12)
     assert len(run.queries) == 0  # of the run as it was opened
     assert len(Run.open(folder).queries) == len(pair.table)
+
+    (sessions / "ios_map").unlink()  # the map changes, and is made again without the queries, as it is when it grows
+    shutil.copytree(small_capture / "sessions" / "ios_map", sessions / "ios_map", symlinks=True)
+    for name in ("trajectories.txt", "images.txt"):
+        lines = (sessions / "ios_map" / name).read_text().splitlines()
+        (sessions / "ios_map" / name).write_text("\n".join(lines[:-1]) + "\n")
+    with pytest.raises(ArtifactError, match="run the localize stage again"):
+        Run.open(folder).map()
+    pipeline.run(manifest, only="map", say=lambda *a, **k: None)
+    grown = Run.open(folder).map()
+    assert len(grown.session) == len(mapped) - 1
+    assert localize_image(grown, session.image_path(0), cameras[0]).world_from_rig is not None
 
 
 def test_the_best_query_has_a_pose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,7 +35,7 @@ from toolkit.capture import Session
 from toolkit.capture.images import HEADER_ERRORS, camera_text
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import COMMAND, ArtifactError, CaptureError, DamagedError, ImageError, ManifestError, first_line
-from toolkit.exchange.georeference import GEO_COLUMNS, geographic_poses, origin_of
+from toolkit.exchange.georeference import GEO_COLUMNS, deviation_of, geographic_poses, origin_of
 from toolkit.exchange.submission import open_captures
 from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures, PairMatches
 from toolkit.features.stores import FeatureStore, MatchStore, features_path, match_name, write_features, write_matches
@@ -459,7 +459,7 @@ def _opened(path: Path) -> h5py.File:
 
 def geo_table(run: str | Path, capture: str | Path | None = None) -> pd.DataFrame:
     """Return a row per query image of a run and map with an origin: `KEYS`, `georeference.GEO_COLUMNS`, `num_inliers`,
-    `position_std_m` and `path`, the file. The columns of the pose are NaN without a pose.
+    `position_std_m` with that of the map's place, and `path`, the file. The pose's columns are NaN without a pose.
 
     Raise CaptureError if no map has an origin; ArtifactError if there are no poses, or only outdated ones.
     """
@@ -470,12 +470,15 @@ def geo_table(run: str | Path, capture: str | Path | None = None) -> pd.DataFram
             for (map_device, query_device), path in pairs_of(SceneFiles(run, scene).poses_dir).items():
                 results = PairResults.open(path)
                 results.require_current()
+                mapped = capture_of(scene)[f"{map_device}_map"]
                 try:
-                    origin = origin_of(capture_of(scene)[f"{map_device}_map"])
+                    origin = origin_of(mapped)
                 except CaptureError as error:
                     refused.append(error)
                     continue
-                tables.append(_table_of(results, capture_of(scene)[f"{query_device}_query"], origin, scene))
+                table = _table_of(results, capture_of(scene)[f"{query_device}_query"], origin, scene)
+                table["position_std_m"] = np.hypot(table["position_std_m"], deviation_of(mapped))
+                tables.append(table)
     if not tables:
         raise refused[0] if refused else ArtifactError(f"{run}: no query was localized. Run the localize stage first.")
     return pd.concat(tables, ignore_index=True)

@@ -16,7 +16,7 @@ from toolkit.capture.session import IMPORT_RECORD
 from toolkit.capture.upright import up_of_cameras
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.recordings import numbers_in, read_csv
-from toolkit.files import own_name, read_json
+from toolkit.files import IMPORTED, own_name, read_json
 from toolkit.geometry import Floats, invert, make_pose
 
 MAX_ERRORS_M = (0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
@@ -28,6 +28,7 @@ MAX_TILT_DEG = 2.0  # largest standard deviation of the vertical by known positi
 NEAR_PX = 0.02  # largest distance of a point's observations from the given pixel, in multiples of the image's width
 MAX_DEPTHS = 1.15  # largest ratio of the depths of the points there
 RECORD = "proc/reconstruction.json"
+WORLD_DEVIATION = "deviation of the world, m"  # in records: standard deviation of the map's place by known positions
 GEO_COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "heading_deg", "pitch_deg")
 _EARTH_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84
 _SQUARE = _FLATTENING * (2 - _FLATTENING)  # squared eccentricity
@@ -95,13 +96,13 @@ def place(
         return Placing(None, record, [f"{how}: does not fit the model"])
     new_from_old, fitting, residual_m, scale_deviation, level = fitted
     facts = f"{np.count_nonzero(fitting)} of {len(common)} photographs, residual {residual_m:.2g} m in the median, "
-    facts += f"scale known to {100 * scale_deviation:.1g} %"
+    facts += f"scale known to {float(f'{100 * scale_deviation:.1g}'):g} %"
     if scale_deviation > MAX_SCALE_DEVIATION:
         return Placing(None, record, [f"{how}: of no use for the scale, as the cameras are too close ({facts})"])
     model.transform(new_from_old)
     by = how if level else "the cameras"
     record |= {"meters": how, "residual_m": residual_m, "scale deviation": scale_deviation, "up": f"by {by}"}
-    record["z is up"] = level
+    record |= {"z is up": level, WORLD_DEVIATION: residual_m / np.sqrt(np.count_nonzero(fitting))}
     if origin is not None:
         record["origin"] = dict(zip(GEO_COLUMNS[:3], origin.tolist(), strict=True))
         record["axes"] = "x east, y north, z up"
@@ -120,7 +121,7 @@ def _place_by_poses(
     ours = np.stack([_upright(images[name], 0) for name in names])
     found = align_to_map(ours, np.stack([prior[name] for name in names]), center_noise_m=PRIOR_NOISE_M)
     facts = f"{found.num_consistent} of {len(names)} photographs, residual {found.rmse_m:.2g} m, "
-    facts += f"scale known to {100 * found.scale_std:.1g} %"
+    facts += f"scale known to {float(f'{100 * found.scale_std:.1g}'):g} %"
     if not found.scale_std <= MAX_SCALE_DEVIATION:
         return Placing(None, record, [f"{PRIOR}: of no use for the scale ({facts}; {found.reason})"])
     by = found.world_from_model
@@ -152,7 +153,7 @@ def alignment(
     for number, (name, world_from_cam) in enumerate(world_from_cams.items(), start=1):
         camera = pycolmap.Camera(camera_id=number, model="SIMPLE_PINHOLE", width=2, height=2, params=[1, 1, 1])
         model.add_camera_with_trivial_rig(camera)
-        image = pycolmap.Image(name, camera_id=number, image_id=number)
+        image = pycolmap.Image(f"{IMPORTED}{name}", camera_id=number, image_id=number)  # `place` wants the user's name
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(invert(world_from_cam)[:3]))
     before = np.vstack([np.zeros(3), np.eye(3)])
     corners = [model.add_point3D(corner, pycolmap.Track()) for corner in before]
@@ -328,6 +329,12 @@ def origin_of(session: Session) -> Floats:
     do = "Reconstruct it from photographs with GPS. Or, if its axes are east, north and up, in meters, write the key"
     keys = f"`origin` with {', '.join(GEO_COLUMNS[:3])} into {IMPORT_RECORD}"
     raise CaptureError(f"{session.path}: {fault}. {do} {keys}.")
+
+
+def deviation_of(session: Session) -> float:
+    """Return the standard deviation of a map's place on the Earth, meters; 0 if it is not known."""
+    records = [read_json(session.path / name) for name in (RECORD, IMPORT_RECORD)]
+    return float(next((record[WORLD_DEVIATION] for record in records if WORLD_DEVIATION in record), 0.0))
 
 
 def _earth_fixed(geo: Floats) -> Floats:

@@ -76,7 +76,7 @@ def gather(
     images would have one name.
     """
     items, unreadable = list[SourceImage](), dict[str, str]()
-    for name, source in _files(sources, made, fps, prefixed or len(sources) > 1):
+    for name, source in _files(sources, made, fps, prefixed or len(sources) > 1, unreadable):
         try:
             name, path = _converted(name, source, made)
             _, exif = read_header(path)
@@ -92,8 +92,10 @@ def gather(
     return items, unreadable
 
 
-def _files(sources: Sequence[Path], made: Path, fps: float | None, prefixed: bool) -> Iterator[tuple[str, Path]]:
-    """Yield name and file of each image."""
+def _files(
+    sources: Sequence[Path], made: Path, fps: float | None, prefixed: bool, unreadable: dict[str, str]
+) -> Iterator[tuple[str, Path]]:
+    """Yield name and file of each image; note videos in folders that cannot be read."""
     for source in sources:
         prefix = f"{source.stem if source.is_file() else source.resolve().name}/" if prefixed else ""
         if source.is_dir():
@@ -102,7 +104,10 @@ def _files(sources: Sequence[Path], made: Path, fps: float | None, prefixed: boo
                     continue  # the capture is in the folder of the images, from a command that was stopped
                 if name.lower().endswith(VIDEO_SUFFIXES):
                     video = Path(name).with_suffix("").as_posix()
-                    yield from _frames(source / name, made, f"{prefix}{video}/", fps)
+                    try:
+                        yield from _frames(source / name, made, f"{prefix}{video}/", fps)
+                    except CaptureError as error:
+                        unreadable[prefix + name] = str(error)
                 else:
                     yield prefix + name, source / name
         elif source.suffix.lower() in VIDEO_SUFFIXES:

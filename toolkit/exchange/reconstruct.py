@@ -30,7 +30,7 @@ from toolkit.capture.images import camera_text, default_workers, exif_key, prefe
 from toolkit.capture.names import is_linked_here, note_linked_here
 from toolkit.capture.tables import write_table
 from toolkit.embedders.vlad import Vlad
-from toolkit.errors import CaptureError, ManifestError, WeightsError
+from toolkit.errors import COMMAND, CaptureError, ManifestError, WeightsError
 from toolkit.exchange.colmap_model import inverse
 from toolkit.exchange.drafts import AXES, SUBSESSION, Draft, DraftImage, every_nth, list_images, start
 from toolkit.exchange.georeference import RECORD, place, read_positions
@@ -255,9 +255,7 @@ class _Work:
         priors = []
         for image in np.flatnonzero(np.isfinite(self.prior).all(axis=(1, 2))).tolist():
             number, camera_id = self.image_ids[image], self.camera_ids[self.camera_of[image]]
-            prior = pycolmap.PosePrior(
-                position=self.prior[image, :3, 3], position_covariance=noise_m**2 * np.eye(3)
-            )
+            prior = pycolmap.PosePrior(position=self.prior[image, :3, 3], position_covariance=noise_m**2 * np.eye(3))
             prior.pose_prior_id, prior.coordinate_system = number, pycolmap.PosePriorCoordinateSystem.CARTESIAN
             prior.corr_data_id = pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id), number)
             priors.append(prior)
@@ -474,8 +472,9 @@ def reconstruct(
             given = parse_camera("camera", camera)
         except ValueError as error:
             raise ManifestError(f"camera: {error}") from None
-    if not items:
-        raise CaptureError(f"{sources[0]}: no photograph can be read. First: {next(iter(unreadable.items()))}")
+    if len(items) < MIN_MODEL:
+        why = "".join(f" {name}: {reason}." for name, reason in [*unreadable.items()][:1])
+        raise CaptureError(f"{sources[0]}: {len(items)} photographs can be read, expected {MIN_MODEL} or more.{why}")
     cameras = dict.fromkeys((item.name for item in items), given) if given is not None else {}
     tabled = _of_items(read_intrinsics(Path(table)), items, table) if table is not None else {}
     cameras |= tabled
@@ -531,7 +530,7 @@ def reconstruct(
                     f"reprojection error {error_px:.2f} px", *notes]  # fmt: skip
     if sizes[1:]:
         where = ", ".join(f"{size} in {path}" for size, path in zip(sizes[1:], paths[1:], strict=True))
-        draft.notes.append(f"not connected to it, so not used: models of {where}")
+        draft.notes.append(f"not connected to it, so not used: models of {where}; IMAGES: {folder / 'sessions'}")
     if work.exif_px and not work.exif_used:
         count = sum(number in work.exif_px for number in work.camera_of)
         draft.notes.append(f"the focal length in EXIF of {count} photographs is not used, as no model fits it")
@@ -585,14 +584,21 @@ def reconstruct_once(
         ManifestError: as for `reconstruct`.
     """
     source = Path(photographs)
-    names = [""] if source.is_file() else list_images(source, TAKEN_SUFFIXES)
-    inputs = {"photographs": str(source.resolve()), "hold_out": hold_out, "camera": camera}
-    inputs["files of photographs"] = files_fingerprint([source / name for name in names])
+    inputs = inputs_of([source], hold_out=hold_out, camera=camera)
     session = Path(capture) / "sessions" / f"{device}_map"
     return once(
         session, inputs,
         lambda record: reconstruct([source], capture, device, camera=camera, hold_out=hold_out, record=record).report,
     )  # fmt: skip
+
+
+def inputs_of(sources: Sequence[Path], **options: Any) -> dict[str, Any]:
+    """Return what a reconstruction is made from, as `proc/import.json` has it."""
+    names = [list_images(source, TAKEN_SUFFIXES) if source.is_dir() else [""] for source in sources]
+    paths = [source / name for source, inside in zip(sources, names, strict=True) for name in inside]
+    told = {name: one if one is None or isinstance(one, int | float) else str(one) for name, one in options.items()}
+    places = ", ".join(str(source.resolve()) for source in sources)
+    return {"photographs": places, **told, "files of photographs": files_fingerprint(paths)}
 
 
 def _escalate(work: _Work, models: Sequence[pycolmap.Reconstruction]) -> list[str]:
@@ -681,7 +687,8 @@ def add_recording(
     new = [item for item in gathered if item.path.resolve() not in known]
     names = {item.name for item in old.values()}
     if not new or any(item.name in names for item in new):
-        raise CaptureError(f"{sources[0]}: its photographs, or others of these names, are in {session} already.")
+        do = f"To finish a map whose making was stopped: {COMMAND} run MANIFEST --only map."
+        raise CaptureError(f"{sources[0]}: its photographs, or others of these names, are in {session} already. {do}")
     work = _Work(folder, device, [*old.values(), *new], {})
     _keep_cameras(work, base, {item.name: number for number, item in old.items()})
     work.extract(LocalMethod("sift", SiftExtractor(), _Mutual(RATIO, shorten=KINDS["sift"].shorten)), range(len(work)))
@@ -708,29 +715,31 @@ def add_recording(
 
 
 def remove_recording(name: str, capture: str | Path, device: str = "ios") -> str:
-    """Remove the images whose names start with a recording's name from the map session; return what was done, in words.
+    """Remove the images of a recording, or one image, by name from the map session; return what was done, in words.
 
     Raise CaptureError if the session was not reconstructed, no image has such a name, or all have.
     """
     folder, session = Path(capture) / FOLDER, Path(capture) / "sessions" / f"{device}_map"
     model, opened = _model(folder, session), Session.open(session)
-    gone = {one for one in opened.image_names if own_name(one).startswith(f"{name}/")}
+    gone = {one for one in opened.image_names if f"{own_name(one)}/".startswith(f"{name}/")}
     if not 0 < len(gone) < len(opened.image_names):
         recordings = sorted({own_name(one).partition("/")[0] for one in opened.image_names if "/" in own_name(one)})
         found = f"{len(gone)} of {len(opened.image_names)} images of recording {name!r}"
         raise CaptureError(f"{session}: found {found}. Recordings: {', '.join(recordings) or 'one, without a name'}.")
-    keys = {(str(row["timestamp"]), row["sensor_id"]) for row, one in
-            zip(opened.images.to_dict("records"), opened.image_names, strict=True) if one in gone}  # fmt: skip
+    rows_of_images = [*zip(opened.images.to_dict("records"), opened.image_names, strict=True)]
+    keys = {(str(row["timestamp"]), row["sensor_id"]) for row, one in rows_of_images if one in gone}
+    kept_sensors = {row["sensor_id"] for row, one in rows_of_images if one not in gone}
+    keys |= {(sensor, "") for _, sensor in keys if sensor not in kept_sensors}  # id and name in sensors.txt
     with write_folder(session, replace=True, keep=True) as changed:
-        for path in (changed / "images.txt", changed / "trajectories.txt"):
+        for path in (changed / "images.txt", changed / "trajectories.txt", changed / "sensors.txt"):
             rows = ((line, line.split(",")) for line in path.read_text(encoding="utf-8").splitlines())
             kept = [line for line, cells in rows if line.startswith("#") or (*map(str.strip, cells[:2]),) not in keys]
             write_table(path, None, kept)
-        for one in gone:
-            (changed / RAW_DATA / one.partition(f"/{RAW_DATA}/")[2]).unlink(missing_ok=True)
+        for old in (f"{RAW_DATA}/{IMPORTED}{name}", f"{MASKS}/{IMPORTED}{name}", f"{MASKS}/{IMPORTED}{name}.png"):
+            (shutil.rmtree if (changed / old).is_dir() else Path.unlink)(changed / old, True)
         table = pd.read_csv(changed / "proc" / "import.csv", dtype=str, keep_default_na=False)
         with write_atomic(changed / "proc" / "import.csv") as temporary:
-            table[~table["image"].str.startswith(f"{name}/")].to_csv(temporary, index=False)
+            table[~(table["image"] + "/").str.startswith(f"{name}/")].to_csv(temporary, index=False)
         if is_linked_here(session):
             note_linked_here(changed)
     for image in [image for image in model.images.values() if image.name in gone and image.has_pose]:

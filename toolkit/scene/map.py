@@ -32,7 +32,7 @@ from toolkit.features.matching import (
     needs_upright,
 )
 from toolkit.features.stores import FeatureStore, OnDemandFeatures, extract_session
-from toolkit.files import RAW_DATA, SceneFiles, image_name, require_current
+from toolkit.files import RAW_DATA, SceneFiles, image_name, map_record_path, require_current
 from toolkit.geometry import Floats, Ints, unit
 from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings
 from toolkit.mapping.build import build_map
@@ -168,10 +168,16 @@ class Map:
             if not isinstance(value, kind):
                 raise ArtifactError(f"Map.open: found {value!r}, expected a run folder, a scene name and a device key.")
         files = SceneFiles(Path(run), scene)
-        localized = last_localized(files, pairs := pairs_in_map(files, device))
+        pairs, alone = pairs_in_map(files, device), map_record_path(files.poses_dir, scene, device).with_suffix(".h5")
         of_map = [".jsonl", ".npz", *(f"/{device}_map/{name}" for name in (*SESSION_FILES, RAW_DATA))]
-        for pair in pairs:
-            require_current(pair.with_suffix(".txt"), "localize", of_map, missing=False)
+        try:
+            for pair in pairs:
+                require_current(pair.with_suffix(".txt"), "localize", of_map, missing=False)
+        except ArtifactError:  # of an earlier map; one that was made without queries since is opened
+            if not alone.is_file():
+                raise
+            pairs = [alone]
+        localized = last_localized(files, pairs)
         reranked = Path(localized[1][RETRIEVAL]).name == files.reranked_dir.name
         return replace(cls._stored_in(device, localized, files.features, files.maps), files=files, reranked=reranked)
 

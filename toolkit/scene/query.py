@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 _MAX_DEVIATION = 1e-3
 """Largest deviation of R @ R.T from the identity for a rotation R; rounding to float32 or in files stays below."""
 MAX_MAP_CAMERAS = 1000  # cameras of the map among which that of an image is looked for, at most
+SAME_CAMERA = 5e-3  # difference of two estimates of a parameter: relative, or of a coefficient of distortion
 FOCAL_PRIOR = 1.2  # focal length of a camera that nothing is known of, in multiples of the longer side
 Image = Any
 """A file (str, Path), or pixels as `pixels_from` takes them."""
@@ -138,14 +139,12 @@ class MapCameras:
 
     def __init__(self, session: Session) -> None:
         """Take the map's session; raise CaptureError if the intrinsics of a camera are malformed."""
-        sensors = session.sensors
-        ids = sensors.loc[sensors["sensor_type"] == "camera", "sensor_id"].head(MAX_MAP_CAMERAS)
-        self._session, self._cameras = session, {str(name): session.camera(str(name)) for name in ids}
-        first = session.images.drop_duplicates("sensor_id")["sensor_id"]
-        self._images = {name: session.image_path(row) for row, name in first.items() if name in self._cameras}
-        """An image of each camera that has one."""
+        first = session.images["sensor_id"].iloc[session.camera_rows].drop_duplicates().head(MAX_MAP_CAMERAS)
+        self._session, self._cameras = session, {str(name): session.camera(str(name)) for name in first}
+        self._images = {str(name): session.image_path(row) for row, name in first.items()}
+        """The first image of each camera."""
         self._keys = dict[str, tuple[str, ...]]()
-        self._alike = dict[Any, dict[str, str]]()
+        self._found = dict[Any, GuessedCamera | None]()
 
     def find(self, size: tuple[int, int], key: tuple[str, ...], folder: str, loosely: bool) -> GuessedCamera | None:
         """Return the intrinsics of the only camera that may have taken an image; None if there is none, or several.
@@ -159,28 +158,28 @@ class MapCameras:
         found = self._only_one(size, key, folder, False) if any(key) else None
         return self._only_one(size, key, folder, True) if found is None and loosely else found
 
-    def _only_one(
-        self, size: tuple[int, int], key: tuple[str, ...], folder: str, loosely: bool
-    ) -> GuessedCamera | None:
-        asked = size, key, loosely
-        if asked not in self._alike:
-            fitting = {name: one for name, one in self._cameras.items() if (one.width, one.height) == size}
-            self._alike[asked] = {
-                name: camera_text(one) for name, one in fitting.items() if self._is(name, key, loosely)
-            }
-        alike = self._alike[asked]
-        if len({*alike.values()}) > 1:
-            alike = {name: text for name, text in alike.items() if folder in self._folders.get(name, ())}
-        if len({*alike.values()}) != 1:
-            return None
-        return GuessedCamera(self._cameras[next(iter(alike))], "that of the map's camera")
+    def _only_one(self, *asked: Any) -> GuessedCamera | None:
+        """Return the intrinsics that all cameras have which may be meant, up to the errors of two estimates."""
+        size, key, folder, loosely = asked
+        if asked not in self._found:
+            fitting = [name for name, one in self._cameras.items() if (one.width, one.height) == size]
+            alike = {name: self._cameras[name] for name in fitting if self._is(name, key, loosely)}
+            if len(alike) > 1:
+                alike = {name: one for name, one in alike.items() if folder in self._folders[name]} or alike
+            first = next(iter(alike.values()), None)
+            same = first is not None and all(
+                one.model == first.model and np.allclose(one.params, first.params, SAME_CAMERA, SAME_CAMERA)
+                for one in alike.values()
+            )
+            self._found[asked] = GuessedCamera(first, "that of the map's camera") if first and same else None
+        return self._found[asked]
 
     def _is(self, sensor: str, key: tuple[str, ...], loosely: bool) -> bool:
         """Tell whether EXIF says that a sensor took an image; loosely, that it does not say the opposite."""
         if loosely and not any(key):
             return True
         if sensor not in self._keys:
-            self._keys[sensor] = _exif_key_of(self._images.get(sensor))
+            self._keys[sensor] = _exif_key_of(self._images[sensor])
         own = self._keys[sensor]
         return all(one == other or (loosely and not (one and other)) for one, other in zip(own, key, strict=True))
 
@@ -192,9 +191,9 @@ class MapCameras:
         return {str(sensor): set(found) for sensor, found in listed.items()}
 
 
-def _exif_key_of(path: Path | None) -> tuple[str, ...]:
+def _exif_key_of(path: Path) -> tuple[str, ...]:
     try:
-        return exif_key({} if path is None else read_header(path)[1])
+        return exif_key(read_header(path)[1])
     except ImageError:
         return exif_key({})
 
