@@ -14,6 +14,9 @@ from toolkit.files import process_tag
 
 TEXT_BARS = "TOOLKIT_TEXT_BARS"
 """Environment variable that makes progress bars text; set in kernels, whose widgets no one sees."""
+HEAPS = str(max(os.cpu_count() or 1, 2))
+"""Heaps of glibc in a kernel. By default, up to eight a core each keep what large arrays of their threads have freed:
+1.8 instead of 1.35 GB with ALIKED (STRECHA_HARD, 2 cores), in the same time. `MALLOC_ARENA_MAX` of the user wins."""
 _ARGUMENTS = [
     # Hides the kernel's messages about its own shutdown.
     "--log-level=CRITICAL",
@@ -123,7 +126,7 @@ class Kernels:
             return clients[-1]
 
         manager.client = client  # type: ignore[method-assign]
-        environment = os.environ | {TEXT_BARS: "1"}
+        environment = {"MALLOC_ARENA_MAX": HEAPS} | os.environ | {TEXT_BARS: "1"}
         run_sync(manager.start_kernel)(cwd=str(self._cwd), env=environment, extra_arguments=_ARGUMENTS)
         self._running.append(RunningKernel(manager, folder, clients))
         return self._running[-1]
