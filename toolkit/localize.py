@@ -442,18 +442,18 @@ class _Pair:
 
     def _is_open(self, items: Items, todo: _Todo) -> bool:
         """Tell whether a query should be retried in the round of its item."""
-        first = self._stored(items, todo)[0]
+        first, latest = self._stored(items, todo)
         unsure = self.map.is_unsure(first) and self.map.needs_fallback(*self.query(todo[2]), first)
-        return unsure and bool(self._asked(items, todo))
+        return unsure and bool(self._asked(todo, first, latest))
 
-    def _asked(self, items: Items, todo: _Todo) -> Sequence[References]:
+    def _asked(self, todo: _Todo, first: QueryResult, latest: QueryResult) -> Sequence[References]:
         """Return the references that a query asks in the round of its item, see `Map.references_of_retry`."""
         references = self.stored.references_of(self.map, self.rows[todo[2]])
-        return self.map.references_of_retry(todo[0].endswith(_FEW), references, *self._stored(items, todo))
+        return self.map.references_of_retry(todo[0].endswith(_FEW), references, first, latest)
 
     def add_fallback(self, items: Items, todo: Sequence[_Todo]) -> None:
         """Extract and match the fallback features of queries."""
-        self._add_features(self.map.escalation, {one[2]: self._asked(items, one) for one in todo})
+        self._add_features(self.map.escalation, {one[2]: self._asked(one, *self._stored(items, one)) for one in todo})
 
     def localize_into(
         self, items: Items, todo: Sequence[_Todo], retry_s: float | None = None
@@ -469,8 +469,9 @@ class _Pair:
 
         def retried() -> Iterator[_Task]:
             for one in todo:
-                latest = earlier[one[2]] = self._stored(items, one)[1]
-                yield one[2], (self.query(one[2])[0], self._asked(items, one)), latest, retry_s or 0.0
+                first, latest = self._stored(items, one)
+                earlier[one[2]] = latest
+                yield one[2], (self.query(one[2])[0], self._asked(one, first, latest)), latest, retry_s or 0.0
 
         if retry_s is None:
             results = self._run(self._locate, self._predicted(list(of_number)), len(todo))
