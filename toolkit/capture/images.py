@@ -356,17 +356,22 @@ class GuessedCamera(NamedTuple):
 
 
 def exif_camera(path: Path) -> GuessedCamera:
-    """Guess the intrinsics of an image from its EXIF tags: no distortion, principal point in the image center.
+    """Return `camera_from_exif` of the header of an image, which is read; raise ImageError also if it cannot be."""
+    return camera_from_exif(*read_header(path))
+
+
+def camera_from_exif(size: tuple[int, int], exif: Mapping[int, Any]) -> GuessedCamera:
+    """Guess the intrinsics of an image from its header: no distortion, principal point in the image center.
 
     FocalLengthIn35mmFilm refers to the diagonal of 36 mm x 24 mm film (CIPA DC-008). Without that tag, the focal length
     is FocalLength times FocalPlaneXResolution, scaled if the image was resized later. An image whose sides have another
-    ratio than in EXIF was cropped; the tags are those of the whole image. Raise ImageError if the image cannot be read,
-    or has no focal length in EXIF.
+    ratio than in EXIF was cropped; the tags are those of the whole image. Raise ImageError if EXIF has no focal
+    length.
 
     Returns:
         A SIMPLE_PINHOLE camera, and a phrase that names the tags used.
     """
-    (width, height), exif = read_header(path)
+    width, height = size
     focal_mm, film_mm = read_number(exif, _FOCAL_MM), read_number(exif, _FOCAL_35MM)
     plane_x, unit_mm = read_number(exif, _PLANE_X), _UNIT_MM.get(read_number(exif, _PLANE_UNIT))
     whole = sorted([read_number(exif, _WIDTH), read_number(exif, _HEIGHT)])

@@ -19,8 +19,8 @@ from toolkit import geometry
 from toolkit.capture import Session
 from toolkit.capture.images import (
     GuessedCamera,
+    camera_from_exif,
     camera_text,
-    exif_camera,
     exif_key,
     find_mask,
     parse_camera,
@@ -216,7 +216,7 @@ def known_camera(image: Image, cameras: MapCameras | None = None) -> GuessedCame
     if isinstance(image, str | Path):
         (size, exif), folder = read_header(Path(image)), Path(image).parent.name
         try:
-            guess = exif_camera(Path(image))
+            guess = camera_from_exif(size, exif)
         except ImageError as error:
             guess = error
     else:
