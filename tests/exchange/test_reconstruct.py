@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -13,8 +14,9 @@ from typer.testing import CliRunner
 
 from toolkit import pipeline
 from toolkit.__main__ import app
-from toolkit.capture import Capture
+from toolkit.capture import Capture, Session
 from toolkit.capture.images import camera_text
+from toolkit.capture.session import RECONSTRUCTION_RECORD
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange import reconstruct as module
 from toolkit.exchange.interchange import import_colmap
@@ -24,6 +26,7 @@ from toolkit.features.features import SiftExtractor
 from toolkit.features.stores import extract_session, features_path
 from toolkit.files import read_json
 from toolkit.geometry import Floats, qt_from_pose
+from toolkit.scene.map import Map
 
 
 @pytest.fixture(scope="session")
@@ -46,11 +49,22 @@ def place(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+def estimated_cameras(session: Session) -> set[str]:
+    """Return the intrinsics that `Map` takes for estimated."""
+    return Map.estimated_cameras.func(SimpleNamespace(session=session))  # type: ignore[attr-defined]
+
+
 def relative_rotations_deg(ours: Floats, true: Floats) -> Floats:
     """Angles between the relative rotations of neighbors."""
     apart = [poses[:-1, :3, :3].transpose(0, 2, 1) @ poses[1:, :3, :3] for poses in (ours, true)]
     trace = np.einsum("nij,nij->n", *apart)
     return np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+
+
+def test_cameras_that_were_estimated_are_known_to_the_map(place: Path, small_capture: Path) -> None:
+    session = Capture.open(place)["ios_map"]
+    assert estimated_cameras(session) == {camera_text(session.camera(session.images["sensor_id"].iloc[0]))}
+    assert estimated_cameras(Capture.open(small_capture)["ios_map"]) == set()
 
 
 def test_poses_are_those_of_the_truth(place: Path, small_capture: Path) -> None:
@@ -81,7 +95,7 @@ def test_every_photograph_has_a_row(place: Path) -> None:
     assert (rows == "imported").sum() == 6
     assert "no matches" in rows["blank.png"]
     assert "image" in rows["torn.jpg"]
-    record = read_json(place / "sessions/ios_map" / module.RECORD)
+    record = read_json(place / "sessions/ios_map" / RECONSTRUCTION_RECORD)
     assert (record["photographs"], record["registered"]) == (8, 6)
 
 
@@ -126,6 +140,7 @@ def test_known_cameras_and_rough_poses(photographs: Path, small_capture: Path, t
     found = capture["ios_map"]
     assert capture.unit == "m"
     assert camera_text(found.camera(found.images["sensor_id"].iloc[0])) == camera_text(camera)
+    assert estimated_cameras(found) == set()
     apart = true[:, :3, 3] - found.world_from_cam()[:, :3, 3]
     assert np.linalg.norm(apart, axis=1).max() < 0.08
     assert relative_rotations_deg(found.world_from_cam(), true).max() < 0.2
@@ -222,7 +237,7 @@ def test_two_places_are_two_models(photographs: Path, tmp_path: Path) -> None:
     (other / "000.png").unlink()
     (other / "001.png").unlink()
     result = reconstruct([photographs, other], tmp_path / "PLACE")
-    record = read_json(tmp_path / "PLACE/sessions/ios_map" / module.RECORD)
+    record = read_json(tmp_path / "PLACE/sessions/ios_map" / RECONSTRUCTION_RECORD)
     assert (record["registered"], record["other models"]) == (6, [4])
     left = result.report.images.set_index("image")["status"]
     assert "in model 1, of 4 photographs" in left["other/002.png"]

@@ -1,13 +1,15 @@
 """Whether matches contradict the intrinsics of a query: known answers, and what noise alone does."""
 
+from dataclasses import replace
+
 import numpy as np
 import pycolmap
 import pytest
 from numpy.typing import NDArray
 
 from toolkit import geometry
-from toolkit.pose.base import Matches, RigQuery
-from toolkit.pose.map_matching import MAX_SHARES, IntrinsicsCheck, check_intrinsics
+from toolkit.pose.base import CAMERA, Correspondences, Matches, Query, QueryResult, RigQuery, Status, View
+from toolkit.pose.map_matching import MAX_SHARES, IntrinsicsCheck, check_intrinsics, with_own_focals
 
 Floats = NDArray[np.float64]
 MAX_ERROR_DEG = 0.45
@@ -175,3 +177,44 @@ def test_noise_of_the_poses_of_the_map_is_not_blamed_on_the_camera() -> None:
     pose = query.refine(np.eye(4), matches[query.errors_deg(np.eye(4), matches, points) < 3], points)
     assert check_intrinsics(query, pose, matches, points, MAX_ERROR_DEG) is not None
     assert check_intrinsics(query, pose, matches, points, MAX_ERROR_DEG, noise_deg=2.0) is None
+
+
+def localized(depth: tuple[float, float], focals: tuple[float, ...]) -> tuple[Query, QueryResult]:
+    """Return a query whose cameras have other focal lengths than the true ones, and its result with these."""
+    cameras, rig_from_cams = list(map(changed, focals)), np.stack([np.eye(4), TURNED])[: len(focals)]
+    matches, points = scene(np.random.default_rng(3), rig_from_cams, 300, depth)
+    rig = RigQuery(cameras, rig_from_cams, [[] for _ in cameras])
+    agrees = rig.errors_deg(np.eye(4), matches, points) < MAX_ERROR_DEG
+    world_from_rig = geometry.invert(rig.refine(np.eye(4), matches[agrees], points))
+    found = Correspondences(matches.camera, matches.pixels, points, matches.point, agrees)
+    result = QueryResult(
+        Status.OK, world_from_rig=world_from_rig, covariance=np.zeros((6, 6)), remark="first", correspondences=found
+    )
+    return Query([View("", "", camera, False) for camera in cameras], rig_from_cams), result
+
+
+@pytest.mark.parametrize("focals", [(0.993,), (1.008,), (0.995, 1.006)])
+def test_an_image_has_its_own_focal_length_near_that_of_its_camera(focals: tuple[float, ...]) -> None:
+    query, result = localized((4.0, 15.0), focals)
+    own = with_own_focals(query, result, MAX_ERROR_DEG)
+    assert own.world_from_rig is not None
+    assert result.world_from_rig is not None
+    before, after = (np.linalg.norm(pose[:3, 3]) for pose in (result.world_from_rig, own.world_from_rig))
+    assert after < 0.5 * before
+    found = own.remark.removeprefix("first; focal length of the image ").removesuffix(" px").split(", ")
+    assert [float(focal) for focal in found] == pytest.approx([925] * len(focals), rel=0.002)
+    # The covariance covers the first pose.
+    moved = result.world_from_rig[:3, 3] - own.world_from_rig[:3, 3]
+    assert np.sqrt(np.trace(own.covariance[3:, 3:])) == pytest.approx(np.linalg.norm(moved), rel=0.05)
+
+
+def test_where_matches_do_not_tell_the_focal_length_it_stays() -> None:
+    query, result = localized((8.0, 8.0), (1.0,))
+    own = with_own_focals(query, result, MAX_ERROR_DEG)
+    assert own.world_from_rig == pytest.approx(result.world_from_rig, abs=3e-3)
+
+
+def test_without_a_pose_or_with_wrong_intrinsics_there_is_no_own_focal_length() -> None:
+    query, result = localized((4.0, 15.0), (0.993,))
+    for one in (QueryResult.failed("dark"), replace(result, status=Status.LOW_CONFIDENCE, reason=CAMERA)):
+        assert with_own_focals(query, one, MAX_ERROR_DEG) is one

@@ -58,6 +58,7 @@ Strings = NDArray[np.object_]
 Rows = ArrayLike | slice | None
 SUBSESSIONS = "proc/subsessions.txt"
 IMPORT_RECORD = "proc/import.json"
+RECONSTRUCTION_RECORD = "proc/reconstruction.json"
 """What an import has noted in a session: the unit of its poses, `m` or null if unknown, and its inputs."""
 
 

@@ -12,7 +12,7 @@ import pycolmap
 from toolkit.alignment.similarity import align_to_map
 from toolkit.capture import Session
 from toolkit.capture.images import HEADER_ERRORS, ORIENTATION, read_number
-from toolkit.capture.session import IMPORT_RECORD
+from toolkit.capture.session import IMPORT_RECORD, RECONSTRUCTION_RECORD
 from toolkit.capture.upright import up_of_cameras
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.recordings import numbers_in, read_csv
@@ -27,7 +27,6 @@ MAX_SCALE_DEVIATION = 0.1  # largest relative standard deviation of a scale that
 MAX_TILT_DEG = 2.0  # largest standard deviation of the vertical by known positions; else the cameras tell it
 NEAR_PX = 0.02  # largest distance of a point's observations from the given pixel, in multiples of the image's width
 MAX_DEPTHS = 1.15  # largest ratio of the depths of the points there
-RECORD = "proc/reconstruction.json"
 WORLD_DEVIATION = "deviation of the world, m"  # in records: standard deviation of the map's place by known positions
 GEO_COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "heading_deg", "pitch_deg")
 _EARTH_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84
@@ -314,7 +313,7 @@ def origin_of(session: Session) -> Floats:
     Raises:
         CaptureError: the map has no origin on the Earth, or a malformed one.
     """
-    for name in (RECORD, IMPORT_RECORD):
+    for name in (RECONSTRUCTION_RECORD, IMPORT_RECORD):
         origin = read_json(session.path / name).get("origin")
         if origin is not None:
             try:
@@ -333,7 +332,7 @@ def origin_of(session: Session) -> Floats:
 
 def deviation_of(session: Session) -> float:
     """Return the standard deviation of a map's place on the Earth, meters; 0 if it is not known."""
-    records = [read_json(session.path / name) for name in (RECORD, IMPORT_RECORD)]
+    records = [read_json(session.path / name) for name in (RECONSTRUCTION_RECORD, IMPORT_RECORD)]
     return float(next((record[WORLD_DEVIATION] for record in records if WORLD_DEVIATION in record), 0.0))
 
 

@@ -28,12 +28,13 @@ from tqdm.auto import tqdm
 from toolkit.capture import Capture, Session, parse_camera
 from toolkit.capture.images import camera_text, default_workers, exif_key, prefetch, read_header
 from toolkit.capture.names import is_linked_here, note_linked_here
+from toolkit.capture.session import RECONSTRUCTION_RECORD
 from toolkit.capture.tables import write_table
 from toolkit.embedders.vlad import Vlad
 from toolkit.errors import COMMAND, CaptureError, ManifestError, WeightsError
 from toolkit.exchange.colmap_model import inverse
 from toolkit.exchange.drafts import AXES, SUBSESSION, Draft, DraftImage, every_nth, list_images, start
-from toolkit.exchange.georeference import RECORD, place, read_positions
+from toolkit.exchange.georeference import place, read_positions
 from toolkit.exchange.import_report import ImportReport
 from toolkit.exchange.interchange import once, read_intrinsics, read_poses
 from toolkit.exchange.photographs import TAKEN_SUFFIXES, Prefixes, SourceImage, gather, initial_cameras, join, read_rigs
@@ -524,6 +525,7 @@ def reconstruct(
         "mapper": mapper, "features": [method.name for method, _ in work.kinds],
         "points": model.num_points3D(), "track length": model.compute_mean_track_length(),
         "reprojection error, px": error_px, **placed.record,
+        "given intrinsics": sorted({camera_text(work.cameras[number]) for number in work.known}),
     }  # fmt: skip
     draft.record |= {"source": ", ".join(map(str, sources)), **placed.record}
     draft.notes += [f"{sizes[0]} of {record['photographs']} photographs in the model, {record['points']} points, "
@@ -537,7 +539,7 @@ def reconstruct(
     draft.notes += placed.notes
     report = draft.finish(None if rigs else {name for name in held if name in draft.poses})
     for one in filter(None, (report, report.held_out)):
-        write_text(one.session / RECORD, json.dumps(record, indent=1) + "\n")
+        write_text(one.session / RECONSTRUCTION_RECORD, json.dumps(record, indent=1) + "\n")
         _hand_over(work, one.session)
     points = list(model.points3D.values())
     xyz, rgb = np.array([point.xyz for point in points]), np.array([point.color for point in points], np.uint8)
@@ -750,7 +752,7 @@ def remove_recording(name: str, capture: str | Path, device: str = "ios") -> str
 
 def _model(folder: Path, session: Path) -> pycolmap.Reconstruction:
     path = folder / "models" / "0"
-    if not (session / RECORD).is_file() or not path.is_dir():
+    if not (session / RECONSTRUCTION_RECORD).is_file() or not path.is_dir():
         raise CaptureError(f"{session} exists, but was not reconstructed here, so nothing can be added to its model.")
     model = pycolmap.Reconstruction(str(path))
     if any(rig.num_sensors() > 1 for rig in model.rigs.values()):
@@ -839,7 +841,7 @@ def _register(work: _Work, base: pycolmap.Reconstruction, fixed: set[int]) -> py
 
 def _finish(folder: Path, session: Path, model: pycolmap.Reconstruction) -> None:
     model.write(str(folder / "models" / "0"))
-    record = read_json(session / RECORD)
+    record = read_json(session / RECONSTRUCTION_RECORD)
     table = pd.read_csv(session / "proc" / "import.csv")
     record |= {"photographs": len(table), "registered": model.num_reg_images(), "points": model.num_points3D()}
-    write_text(session / RECORD, json.dumps(record, indent=1) + "\n")
+    write_text(session / RECONSTRUCTION_RECORD, json.dumps(record, indent=1) + "\n")

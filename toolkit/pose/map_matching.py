@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import fdtrc
@@ -37,7 +37,7 @@ from toolkit.features.features import KINDS, FeatureKind, LocalFeatures, MutualM
 from toolkit.features.matching import Matcher
 from toolkit.geometry import Floats, Ints
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.base import AGREEMENT, Matches, NetworkMatches, References, RigQuery
+from toolkit.pose.base import AGREEMENT, CAMERA, Matches, NetworkMatches, Query, QueryResult, References, RigQuery
 from toolkit.threads import fixed_sums
 
 MAX_MAP_FEATURES = 1000
@@ -77,6 +77,10 @@ FEW = 0.3  # share of inliers among the matches below which other cameras are tr
 VERY_FEW = 0.2  # share below which they are tried in any case
 TRIALS = 1000  # samples of their RANSAC
 ABSURD = 0.2  # smallest change of the intrinsics, relatively, that makes another camera another
+
+OWN_FOCAL_STD = 3e-3
+"""Relative standard deviation of the focal lengths of images of one camera: between 0, of a fixed focus, and 0.5 %, of
+a phone, which focuses each image anew. The images of a map do not tell which it is, as its points make up for it."""
 
 
 @dataclass(frozen=True)
@@ -524,7 +528,7 @@ def check_intrinsics(
     which = np.arange(problem.unknowns)
     pose = which < 6
     free = pose | (which % 4 == 2) if focal_alone else ~np.zeros(problem.unknowns, bool)
-    start = _Estimate(rig_from_world, np.zeros(problem.unknowns - 6))
+    start = _Estimate(rig_from_world, problem.unchanged)
     first = problem.step(start, free, WIDENINGS[0])
     by_chance = 1.0 if first is None else first.probability(first.change, free & ~pose)
     inliers = problem.inliers(start)
@@ -540,6 +544,39 @@ def check_intrinsics(
         unknown = np.full((len(query.cameras), 4), np.nan)
         return IntrinsicsCheck(np.zeros(6), unknown, np.zeros((len(unknown), 3))) if by_chance < CERTAIN else None
     return problem.check(start, fitted, free, float(np.tan(np.radians(noise_deg)) * query.focals_px.mean()))
+
+
+def with_own_focals(query: Query, result: QueryResult, max_error_deg: float) -> QueryResult:
+    """Return a result with the pose, and in its remark the focal lengths, that fit its correspondences best.
+
+    Each focal length has a normal prior around the stated one, see `OWN_FOCAL_STD`. Errors in a cell of an image are
+    alike, so correspondences count as many as there are cells with one. A result that says that the intrinsics are
+    wrong, or has no pose, is returned as it is. The covariance grows to cover the first pose.
+
+    Args:
+        query: in the lengths of the result.
+        result: of the stated intrinsics.
+        max_error_deg: largest error of an inlier.
+    """
+    found, cameras = result.correspondences, [view.camera for view in query.views]
+    if result.world_from_rig is None or result.reason == CAMERA or not found.agrees.any():
+        return result
+    rig, chosen = RigQuery(cameras, query.rig_from_cams, [[] for _ in cameras]), np.flatnonzero(found.agrees)
+    matches = Matches(found.camera[chosen], found.pixels[chosen], chosen)
+    alike = len(matches) / max(rig.num_cells(matches), 1)
+    problem = _Problem(rig, matches, found.points, max_error_deg, np.full(4, OWN_FOCAL_STD / np.sqrt(alike)))
+    which, start = np.arange(problem.unknowns), _Estimate(geometry.invert(result.world_from_rig), problem.unchanged)
+    fitted = problem.fit(start, (which < 6) | (which % 4 == 2))
+    if fitted is None:
+        return result
+    shift, focals = _motion(start, fitted), rig.focals_px * (1 + fitted.parameters[::4])
+    text = f"focal length of the image {', '.join(f'{focal:.1f}' for focal in focals)} px"
+    return replace(
+        result,
+        world_from_rig=geometry.invert(fitted.rig_from_world),
+        covariance=None if result.covariance is None else result.covariance + np.outer(shift, shift),
+        remark="; ".join(filter(None, [result.remark, text])),
+    )
 
 
 def _try_cameras(stated: "_Problem", start: "_Estimate", inliers: Bools) -> IntrinsicsCheck | None:
@@ -564,7 +601,7 @@ def _try_cameras(stated: "_Problem", start: "_Estimate", inliers: Bools) -> Intr
         if pose is None:
             continue
         problem = _Problem(query, stated.matches, stated.points, stated.max_error_deg)
-        fitted = problem.fit(_Estimate(pose, np.zeros(problem.unknowns - 6)), ~np.zeros(problem.unknowns, bool))
+        fitted = problem.fit(_Estimate(pose, problem.unchanged), ~np.zeros(problem.unknowns, bool))
         if fitted is not None and (found := problem.inliers(fitted)).sum() > MIN_INLIERS and fit_of(found) > best:
             best = fit_of(found)
             changes = np.array(list(map(_change, stated.query.cameras, cameras, fitted.parameters.reshape(-1, 4))))
@@ -627,11 +664,14 @@ class _Step(NamedTuple):
 class _Problem:
     """U unknowns, the pose and the intrinsics of a query, and the K matches to fit them to."""
 
-    def __init__(self, query: RigQuery, matches: Matches, points: Floats, max_error_deg: float) -> None:
+    def __init__(
+        self, query: RigQuery, matches: Matches, points: Floats, max_error_deg: float, prior_std: ArrayLike = PRIOR_STD
+    ) -> None:
         self.query, self.matches, self.points, self.max_error_deg = query, matches, points, max_error_deg
         self._limits_px = np.tan(np.radians(max_error_deg)) * query.focals_px[matches.camera]
-        self._prior = np.diag(np.concatenate([np.zeros(6), np.tile(1 / np.square(PRIOR_STD), len(query.cameras))]))
+        self._prior = np.diag(np.concatenate([np.zeros(6), np.tile(1 / np.square(prior_std), len(query.cameras))]))
         self.unknowns = len(self._prior)
+        self.unchanged = np.zeros(self.unknowns - 6)
 
     def linearize(self, estimate: _Estimate) -> tuple[Floats, Floats]:
         """Return residuals (K, 2), infinite behind a camera, and the Jacobian (K, 2, U) of the projections."""

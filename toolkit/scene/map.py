@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from toolkit import geometry
 from toolkit.capture import Capture, Session
-from toolkit.capture.images import thumbnails, turn_image
+from toolkit.capture.images import camera_text, thumbnails, turn_image
+from toolkit.capture.session import RECONSTRUCTION_RECORD
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_folders, open_descriptors, shows_upright
 from toolkit.embedders.masks import near as within
@@ -32,7 +33,7 @@ from toolkit.features.matching import (
     needs_upright,
 )
 from toolkit.features.stores import FeatureStore, OnDemandFeatures, extract_session
-from toolkit.files import RAW_DATA, SceneFiles, image_name, map_record_path, require_current
+from toolkit.files import RAW_DATA, SceneFiles, image_name, map_record_path, read_json, require_current
 from toolkit.geometry import Floats, Ints, unit
 from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings
 from toolkit.mapping.build import build_map
@@ -56,7 +57,7 @@ from toolkit.pose.base import (
     agree,
 )  # fmt: skip
 from toolkit.pose.local_triangulation import OnDemandLocalizer, PosedImages
-from toolkit.pose.map_matching import MappedFeatures
+from toolkit.pose.map_matching import MappedFeatures, with_own_focals
 from toolkit.pose.pnp import RIVAL_DISTANCE, PnpLocalizer, bounded_by_rivals, clarity_of_support
 from toolkit.prediction.feed_forward import FeedForwardLocalizer, depth_of_images
 from toolkit.prediction.hybrid import MAX_FEATURES, DepthLifter, HybridLocalizer, lifts
@@ -318,6 +319,8 @@ class Map:
         """Return the pose of a query from its matches, in the unit of the map's poses; see `Localizer.solve`."""
         in_lengths = [prior.scaled(1 / self.length) for prior in priors]
         result = (localizer or self.localizer).solve(matches, prediction, in_lengths)
+        if self.estimated_cameras.issuperset(camera_text(view.camera) for view in query.views):
+            result = with_own_focals(matches.query, result, self.settings.pnp.ransac_max_error_deg)
         result = self.finished(query, result.scaled(self.length))
         # Results may be many, so they keep neither pixels of files nor features.
         views = [replace(view, _decoded={}) for view in query.views]
@@ -654,6 +657,13 @@ class Map:
     def cameras(self) -> MapCameras:
         """The cameras of its images, among which that of an image without intrinsics is looked for."""
         return MapCameras(self.session)
+
+    @cached_property
+    def estimated_cameras(self) -> set[str]:
+        """Intrinsics, as `camera_text` writes them, that a reconstruction estimated, for all images of a camera."""
+        record = read_json(self.session.path / RECONSTRUCTION_RECORD)
+        sensors = self.session.images["sensor_id"].iloc[self.session.camera_rows].unique() if record else []
+        return {camera_text(self.session.camera(str(one))) for one in sensors} - {*record.get("given intrinsics", [])}
 
     @property
     def length(self) -> float:
