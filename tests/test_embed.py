@@ -294,6 +294,54 @@ def test_a_killed_run_goes_on_within_a_subsession(
     assert not list((tmp_path / "e").rglob("*.partial*"))
 
 
+def test_only_images_that_were_added_are_embedded(
+    tiny: Path, tmp_path: Path, megaloc: dict[str, object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tiny / "sessions/hl_map/raw_data/hl_a/images/left/1000.png").unlink()
+    go, table = {"device": "hl", **megaloc}, tiny / "sessions/hl_map/images.txt"
+    call(embed_sessions, tiny / "sessions", tmp_path / "whole", **go)  # type: ignore[arg-type]
+    whole = table.read_text()
+    table.write_text("".join(whole.splitlines(keepends=True)[:9]))
+    call(embed_sessions, tiny / "sessions", tmp_path / "e", **go)  # type: ignore[arg-type]
+    table.write_text(whole)
+    embed, seen = MegaLocEmbedder.embed, []
+
+    def counts(self: MegaLocEmbedder, inputs: list[np.ndarray]) -> np.ndarray:
+        seen.append(len(inputs))
+        return embed(self, inputs)
+
+    monkeypatch.setattr(MegaLocEmbedder, "embed", counts)
+    made = call(embed_sessions, tiny / "sessions", tmp_path / "e", **go)  # type: ignore[arg-type]
+    assert seen == [4], "8 of 12 images of the map were there, one of them unreadable"
+    assert made["embedded"].tolist() == [11, 6]
+    for path in (tmp_path / "whole/hl_map").rglob("*.*"):
+        assert (tmp_path / "e/hl_map" / path.relative_to(tmp_path / "whole/hl_map")).read_bytes() == path.read_bytes()
+    # Not if the first images are others.
+    lines = whole.splitlines(keepends=True)
+    table.write_text("".join([*lines[:1], *lines[2:9]]))
+    call(embed_sessions, tiny / "sessions", tmp_path / "other", **go)  # type: ignore[arg-type]
+    table.write_text(whole)
+    seen.clear()
+    call(embed_sessions, tiny / "sessions", tmp_path / "other", **go)  # type: ignore[arg-type]
+    assert sum(seen) == 11
+
+
+def test_the_vocabulary_stays_while_the_map_grows_to_twice_its_images(tiny: Path, tmp_path: Path) -> None:
+    shutil.rmtree(tiny / "sessions/hl_map")  # the vocabulary is of all maps
+    table = tiny / "sessions/ios_map/images.txt"
+    lines = table.read_text().splitlines(keepends=True)
+    vocabularies, first_vectors = [], []
+    for count in (2, 3, 4, 5):
+        table.write_text("".join(lines[: 1 + count]))
+        embed_sessions(tiny / "sessions", tmp_path / "e", device="ios")
+        vocabularies.append((tmp_path / "e/vlad.npz").read_bytes())
+        vectors = np.load(tmp_path / "e/ios_map/ios_a/ios_a.npy")
+        assert len(vectors) == count
+        first_vectors.append(vectors[:2].tobytes())
+    assert [vocabulary == vocabularies[0] for vocabulary in vocabularies] == [True, True, True, False]
+    assert [vectors == first_vectors[0] for vectors in first_vectors] == [True, True, True, False]
+
+
 @pytest.mark.parametrize("dtype", ["float32", "float16"])
 @pytest.mark.parametrize("batches", [[], [0], [5, 0, 5, 2]])
 def test_a_matrix_is_what_numpy_writes(tmp_path: Path, dtype: str, batches: list[int]) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,12 @@ from toolkit.errors import CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures, SiftExtractor
 from toolkit.features.stores import FeatureStore, extract_session
 from toolkit.files import (
-    file_fingerprint,
     files_fingerprint,
     fingerprint,
     is_current,
     link_or_copy,
     read_json,
+    read_sidecar,
     sidecar_path,
     write_atomic,
     write_sidecar,
@@ -46,6 +46,8 @@ VECTORS = "vectors"
 """Name of a batch's array in the file of progress."""
 VOCABULARY_IMAGES = 2048
 """Map images from which the vocabulary is learned, at most, spread evenly: bounds time and memory."""
+GROWTH = 2.0
+"""Factor by which the map images may become more before the vocabulary is learned from all of them."""
 
 
 @retry_damaged
@@ -162,29 +164,32 @@ class _Model:
             record = {
                 "embedder": embedder.settings,
                 "features": SiftExtractor().settings if embedder.inputs == "features" else None,
-                "images": _images_fingerprint(part.session, part.rows),
-                "sensors": file_fingerprint(part.session.path / "sensors.txt"),
-                "turns": fingerprint(part.turns.tolist()) if part.turns.any() else None,
                 "normalize": settings.normalize,
                 "dtype": settings.dtype,
+                **_first_images(part),
             }
             skipped = self._is_current(matrix_path, record)
             if skipped:
                 embedded = len(np.load(matrix_path, mmap_mode="r"))
             else:
+                kept, failed = self._kept(matrix_path, part, record)
+                done = len(kept) + len(failed)
+                new = replace(part, rows=part.rows[done:], turns=part.turns[done:])
                 # Progress is kept per batch, so it depends on the batch size; the matrix does not, up to rounding.
-                source = fingerprint({**record, "rows_a_batch": settings.batch_size})
-                todo = [(f"{at:08d}", source, at) for at in range(-(-len(part.rows) // settings.batch_size))]
+                source = fingerprint({**record, "rows_a_batch": settings.batch_size, "kept": done})
+                todo = [(f"{at:08d}", source, at) for at in range(-(-len(new.rows) // settings.batch_size))]
                 store = store_of(part.session.id) if embedder.inputs == "features" else None
-                arguments = embedder, part, settings, store
+                arguments = embedder, new, settings, store
                 with Items(items_beside(matrix_path), skip_existing=self.skip_existing) as batches:
                     left = batches.distribute(_embed_into, batches.left(todo), arguments, _label(part), "batch")
                     _embed_into(batches, left, *arguments)
                     batches.flush()
-                    failed = {row: reason for name, *_ in todo for row, reason in batches.note(name)["failed"]}
+                    failed |= {done + row: why for name, *_ in todo for row, why in batches.note(name)["failed"]}
                     embedded = len(part.rows) - len(failed)
                     tables = _write_tables(folder, capture.name, part, failed)
-                    vectors = (batches[name][VECTORS] for name, *_ in todo)
+                    starts = range(0, len(kept), settings.batch_size)
+                    before = (kept[start : start + settings.batch_size] for start in starts)
+                    vectors = chain(before, (batches[name][VECTORS] for name, *_ in todo))
                     write_matrix(matrix_path, vectors, embedded, embedder.dim, settings.dtype)
                     write_sidecar(matrix_path, record, tables)
             remove_items(matrix_path)
@@ -219,6 +224,18 @@ class _Model:
                     temporary.unlink()
                     link_or_copy(source.with_name(name), temporary)
         return is_current(path, record)
+
+    def _kept(self, path: Path, part: _Subsession, record: dict[str, Any]) -> tuple[NDArray[Any], dict[int, str]]:
+        """Return the vectors of the images that a subsession had before others were added, and why some have none."""
+        old = (self.skip_existing and read_sidecar(path)) or {}
+        count = old.get("count", 0)
+        if not 0 < count < len(part.rows) or fingerprint(old) != fingerprint(record | _first_images(part, count)):
+            return np.zeros((0, 0)), {}
+        why, table = dict[str, str](), path.parent / "failed.csv"
+        if table.is_file():
+            why = pd.read_csv(table, index_col="abs_path", keep_default_na=False)["reason"].to_dict()
+        names = enumerate(_abs_path(self.capture.name, part.session, row) for row in part.rows[:count])
+        return np.load(path, mmap_mode="r"), {at: why[name] for at, name in names if name in why}
 
     def _subsessions(self, ids: list[str], subsession: str) -> tuple[list[_Subsession], dict[str, CaptureError]]:
         """Return the subsessions to embed, without turns, and the error of each unreadable session."""
@@ -257,27 +274,38 @@ class _Model:
         )
 
     def _vocabulary(self) -> Path:
-        """Learn the VLAD vocabulary from the map images of all devices, unless the file is current."""
+        """Learn the VLAD vocabulary from the map images of all devices, unless the file is current.
+
+        It stays while the map grows, up to `GROWTH`, so that what was embedded with it stays, too.
+        """
         from toolkit.embedders.vlad import VLAD_FORMAT, Vlad
 
-        capture = self.capture
-        images = [(session, int(row)) for session in capture.usable("map") for row in session.camera_rows]
+        capture, path = self.capture, self.out / "vlad.npz"
+        rows_of = {session.id: session.camera_rows for session in capture.usable("map")}
+        maps = {name: _Subsession(capture[name], name, rows, 0 * rows) for name, rows in rows_of.items()}
+        images = [(capture[name], int(row)) for name, rows in rows_of.items() for row in rows]
         if not images:
             fault = "has no <device>_map session that can be read; `vlad` learns its vocabulary from the map"
             raise ToolkitError(f"{capture.path}/sessions {fault}.")
+
+        def record_of(counts: Mapping[str, int]) -> dict[str, Any]:
+            """Return the record of a vocabulary from the first images of each map."""
+            of_maps = {name: _first_images(maps[name], count) for name, count in counts.items()}
+            settings = {"features": SiftExtractor().settings, "seed": self.settings.seed, "format": VLAD_FORMAT}
+            return settings | {"maps": of_maps}
+
+        record = record_of({name: len(rows) for name, rows in rows_of.items()})
+        if self._is_current(path, record):
+            return path
+        old = ((self.skip_existing and read_sidecar(path)) or {}).get("maps", {})
+        counts = {name: one["count"] for name, one in old.items()}
+        enough = GROWTH * sum(counts.values()) >= len(images) and counts.keys() <= maps.keys()
+        if enough and self._is_current(path, record_of(counts)):
+            return path
         chosen: dict[str, list[int]] = {}
         for index in np.linspace(0, len(images) - 1, min(len(images), VOCABULARY_IMAGES)).astype(int).tolist():
             session, row = images[index]
             chosen.setdefault(session.id, []).append(row)
-        record = {
-            "features": SiftExtractor().settings,
-            "images": {name: _images_fingerprint(capture[name], np.array(rows)) for name, rows in chosen.items()},
-            "seed": self.settings.seed,
-            "format": VLAD_FORMAT,
-        }
-        path = self.out / "vlad.npz"
-        if self._is_current(path, record):
-            return path
         stores = {
             name: extract_session(capture[name], self.features, rows=np.array(rows)) for name, rows in chosen.items()
         }
@@ -367,12 +395,20 @@ def write_matrix(path: Path, batches: Iterable[NDArray[np.floating]], rows: int,
             stream.write(np.ascontiguousarray(vectors, dtype).tobytes())
 
 
-def _images_fingerprint(session: Session, rows: NDArray[np.intp]) -> str:
-    """Return a fingerprint of images: their keys, and the name, size and time of change of their files."""
-    table = session.images.iloc[rows]
-    keys = [table[column].tolist() for column in ("timestamp", "sensor_id", "path")]
+def _first_images(part: _Subsession, count: int | None = None) -> dict[str, Any]:
+    """Return the number of the first images of a subsession, and a fingerprint of their keys, cameras and turns, and of
+    the names, sizes and times of change of their files.
+    """
+    session, rows = part.session, part.rows[:count]
+    table, params = session.images.iloc[rows], session.sensors.drop_duplicates("sensor_id").set_index("sensor_id")
+    columns = [table[column].tolist() for column in ("timestamp", "sensor_id", "path")]
+    columns += [params["params"].reindex(table["sensor_id"]).tolist(), session.device_ids[rows].tolist()]
     files = files_fingerprint([*map(session.image_path, rows.tolist()), *session.mask_paths(rows.tolist())])
-    return fingerprint([keys, session.device_ids[rows].tolist(), files])
+    return {"count": len(rows), "images": fingerprint([columns, part.turns[:count].tolist(), files])}
+
+
+def _abs_path(capture: str, session: Session, row: int) -> str:
+    return f"{capture}/sessions/{session.image_name(int(row))}"
 
 
 def _write_tables(folder: Path, capture: str, part: _Subsession, failed: dict[int, str]) -> list[Path]:
@@ -383,7 +419,7 @@ def _write_tables(folder: Path, capture: str, part: _Subsession, failed: dict[in
             "device_id": session.device_ids[part.rows],
             "sensor_id": images["sensor_id"].to_numpy(),
             "timestamp": images["timestamp"].to_numpy(),
-            "abs_path": [f"{capture}/sessions/{session.image_name(int(row))}" for row in part.rows],
+            "abs_path": [_abs_path(capture, session, row) for row in part.rows],
             "reason": [failed.get(int(row), "") for row in part.rows],
         }
     )
