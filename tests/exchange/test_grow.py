@@ -52,6 +52,7 @@ def test_new_photographs_are_registered_and_the_others_stay(
 ) -> None:
     session = first / "sessions" / "ios_map"
     before = {name: (session / name).read_text() for name in TABLES}
+    assert len(extract_session(Capture.open(first)["ios_map"], folders / "earlier")) == 4  # by a run
     extracted, extract = [], SiftExtractor.extract
 
     def count(self: SiftExtractor, images: Sequence[Any]) -> Any:
@@ -75,7 +76,8 @@ def test_new_photographs_are_registered_and_the_others_stay(
     assert found is not None
     spread = np.linalg.norm(theirs - theirs.mean(axis=0), axis=1).mean()
     assert np.linalg.norm(found * ours - theirs, axis=1).max() < 0.1 * spread
-    extract_session(opened, folders / "features")  # a run takes them all from the session
+    for run in ("features", "earlier"):  # a run takes them all from the session
+        assert len(extract_session(opened, folders / run)) == 6
     assert len(extracted) == 3
 
     with pytest.raises(CaptureError, match=r"are in .* already"):

@@ -166,10 +166,18 @@ def extract_session(
         turns = np.zeros(len(session.images), np.int64)
     made_from = {name: _made_from(session, row, int(turns[row])) for name, row in row_of.items()}
     path, label = features_path(out, session.id, extractor.settings), f"{extractor.settings['name']} {session.id}"
-    if not path.exists() and (made := session.path / "proc" / "features" / path.name).is_dir():
-        link_folder(made, path)  # a reconstruction extracted them
+    given = session.path / "proc" / "features" / path.name  # from a reconstruction
+    if not path.exists() and given.is_dir():
+        link_folder(given, path)
     with Items(path, extractor.settings, skip_existing=skip_existing) as items:
         todo = items.left((name, source, row_of[name], int(turns[row_of[name]])) for name, source in made_from.items())
+        if todo and skip_existing and given.is_dir():  # it has grown
+            with Items(given, extractor.settings) as reconstructed:
+                for name, source, *_ in todo:
+                    if reconstructed.is_current(name, source):
+                        items.add(name, source, reconstructed[name], reconstructed.note(name))
+            items.flush()
+            todo = items.left(todo)
         if todo and any(path.parent.glob(f"{path.name.partition('-')[0]}-*.h5")):
             log.warning("%s: features in .h5 files, of an older version of the toolkit, are not used.", path.parent)
         todo = items.distribute(_extract_into, todo, (session, extractor), label, "image")
