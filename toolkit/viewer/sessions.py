@@ -155,7 +155,7 @@ def record_session(
         if localized is not None:
             _log_queries(stream, localized, session, origin)
             counts["queries"] = len(localized.poses)
-        reader = _Reader.of(session, image_size)
+        reader = _Reader(session, image_size)
         writer = _FrameWriter(stream, viewer.camera_depth_m(placed[:, :3, 3]), color_of(session.device))
         writer.announce(frames)
         loaded = prefetch(reader.read, frames, default_workers())
@@ -311,23 +311,16 @@ class _Shot:
     is_depth: bool = False
 
 
-@dataclass(frozen=True)
 class _Reader:
     """Reads the images and depth maps of frames; thread-safe."""
 
-    session: Session
-    image_size: int
-    depths: dict[tuple[int, str], Ints]
-    """Rows of the session's depth maps by timestamp and device."""
-    rig_from_depth: Floats
-
-    @classmethod
-    def of(cls, session: Session, image_size: int) -> "_Reader":
-        if session.depths is None:
-            return cls(session, image_size, {}, np.zeros((0, 4, 4)))
-        times = session.depths["timestamp"].to_numpy(np.int64)
-        devices, rig_from_depth = session.devices_of(times, session.depths["sensor_id"])
-        return cls(session, image_size, pd.DataFrame([times, devices]).T.groupby([0, 1]).indices, rig_from_depth)
+    def __init__(self, session: Session, image_size: int) -> None:
+        self.session, self.image_size, self.depths = session, image_size, dict[tuple[int, str], Ints]()
+        """Rows of the session's depth maps by timestamp and device."""
+        if session.depths is not None:
+            times = session.depths["timestamp"].to_numpy(np.int64)
+            devices, self.rig_from_depth = session.devices_of(times, session.depths["sensor_id"])
+            self.depths = pd.DataFrame([times, devices]).T.groupby([0, 1]).indices
 
     def read(self, frame: _Frame) -> list[_Shot]:
         """Return the images and depth maps of a frame."""
@@ -379,8 +372,6 @@ class _FrameWriter:
 
     def write(self, frame: _Frame, shots: list[_Shot]) -> Counter[str]:
         """Log a frame; return the counts of its images and depth maps by kind."""
-        import rerun as rr
-
         if self._frame is not None and self._frame.subsession != frame.subsession:
             self.end_subsession()
         self._frame = frame
