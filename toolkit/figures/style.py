@@ -58,13 +58,6 @@ def new_figure(width: float, height: float) -> "Figure":
     return figure
 
 
-def inches_to_pixels(inches: float) -> int:
-    """Convert a length in a figure to pixels of its PNG file; call it in a function that is `styled`."""
-    import matplotlib as mpl
-
-    return math.ceil(inches * mpl.rcParams["savefig.dpi"])
-
-
 def picture_of(figure: "Figure") -> bytes:
     """Return a figure as notebooks display and store it: as a JPEG file if that has less than half the size of PNG.
 
