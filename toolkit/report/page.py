@@ -6,7 +6,6 @@ import json
 import math
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -84,18 +83,6 @@ EVALUATION_FIGURES = {
         "image near the true camera; no pose: too few matches agreed; wrong pose: beyond the threshold.",
     ),
 }
-
-
-@dataclass
-class Picture:
-    data: str
-    """data: URL; empty if the page has no room left."""
-    title: str
-    caption: str
-    path: str
-    """Relative to the run folder."""
-    width: int = 0
-    """Width that it is shown with, pixels, so that letters are as large in all pictures."""
 
 
 def write_report(run_dir: str | Path) -> Path:
@@ -633,11 +620,14 @@ class Album:
     def __init__(self, run_dir: Path, room: int, left_out: list[str]) -> None:
         self.run_dir, self.room, self.left_out = run_dir, room, left_out
 
-    def picture(self, path: Path, title: str = "", caption: str = "") -> Picture:
-        """Return a picture for the page; without a `title`, it has the one in the file."""
+    def picture(self, path: Path, title: str = "", caption: str = "") -> dict[str, Any]:
+        """Return a picture for the page, without data if there is no room left; its default title is in the file.
+
+        It is as wide, in pixels, as makes letters equally large in all pictures.
+        """
         from PIL import Image
 
-        name, link = str(path.relative_to(self.run_dir)), _link(self.run_dir, path)
+        name, shown = str(path.relative_to(self.run_dir)), {"data": "", "path": _link(self.run_dir, path)}
         try:
             with Image.open(path) as image:
                 info = getattr(image, "text", {})
@@ -649,9 +639,10 @@ class Album:
                     if len(small) < len(data):  # plots are often smaller as PNG
                         data, kind = small, "jpeg"
         except (OSError, ValueError, SyntaxError) as error:  # Pillow raises the latter two for some torn PNGs
-            return Picture("", f"{name} cannot be read: {error}", "", link)
+            return shown | {"title": f"{name} cannot be read: {error}", "caption": ""}
         if len(data) > self.room:
             self.left_out.append(name)
-            return Picture("", title, caption, link)
+            return shown | {"title": title, "caption": caption}
         self.room -= len(data)
-        return Picture(f"data:image/{kind};base64,{base64.b64encode(data).decode()}", title, caption, link, width)
+        url = f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+        return shown | {"title": title, "caption": caption, "data": url, "width": width}
