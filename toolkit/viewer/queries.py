@@ -294,13 +294,9 @@ class View3D:
         """Write a recording for the rerun viewer, `.rrd`, and return its path."""
         cameras = [answer.details.cameras[0] for answer in self.answers]
         errors = [answer.error or (np.nan, np.nan) for answer in self.answers]
-        table = pd.DataFrame({
-            "status": [answer.result.status_text for answer in self.answers],
-            "method": [answer.result.found_by for answer in self.answers],
-            "num_inliers": [answer.result.num_inliers for answer in self.answers],
-            "rotation_error_deg": [error[0] for error in errors],
-            "translation_error_m": [error[1] for error in errors],
-        })  # fmt: skip
+        rotation_deg, translation = np.reshape(errors, (-1, 2)).T
+        table = pd.DataFrame([answer.result.to_row(0, "") for answer in self.answers])
+        table = table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation)
         estimated = np.array([camera.world_from_cam for camera in cameras]).reshape(-1, 4, 4)
         true = np.array([camera.world_from_cam_true for camera in cameras]).reshape(-1, 4, 4)
         names = [shown_name(answer.name) for answer in self.answers]

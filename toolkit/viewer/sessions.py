@@ -16,8 +16,9 @@ from numpy.typing import ArrayLike
 from tqdm.auto import tqdm
 
 from toolkit.capture import DEPTH_SCALE, Capture, Session, Trajectory
-from toolkit.capture.images import decode, default_workers, prefetch, read_for_display, read_image
+from toolkit.capture.images import default_workers, prefetch, read_for_display, read_image
 from toolkit.capture.names import color_of
+from toolkit.capture.tables import read_depth
 from toolkit.capture.upright import up_of_cameras
 from toolkit.errors import ArtifactError, CaptureError, ImageError
 from toolkit.figures.style import ORANGE
@@ -347,16 +348,14 @@ class _Reader:
 
     def _depth(self, path: Path) -> tuple[bytes, tuple[int, int], bool]:
         try:
-            depth = decode(path, cv2.IMREAD_UNCHANGED)
-        except ImageError:
-            return b"", (0, 0), False
-        if depth.dtype != np.uint16 or depth.ndim != 2:
+            depth = read_depth(path)
+        except CaptureError:
             return b"", (0, 0), False
         scale = min(1.0, self.image_size / 2 / max(depth.shape))
         width, height = (max(1, round(scale * side)) for side in depth.shape[::-1])
         # Nearest: averages across depth edges would float in the air.
         small = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST)
-        return cv2.imencode(".png", small)[1].tobytes(), (width, height), True
+        return cv2.imencode(".png", np.rint(small * DEPTH_SCALE).astype(np.uint16))[1].tobytes(), (width, height), True
 
 
 class _FrameWriter:
