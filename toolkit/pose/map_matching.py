@@ -53,6 +53,9 @@ CACHED_IMAGES = 256
 
 MatchCache = dict[tuple[int, int, int], tuple[Ints, Ints]]
 """(query image, kind of features, map image) -> query keypoints (K,) and the map points (K,) that they match."""
+Candidates = tuple[Matches, Ints]
+"""K candidate matches of a query image and one kind of features, highest score first, with the indices (K,) of their
+keypoints in the image. A keypoint or a point may be in several of them."""
 
 # Of the check of the intrinsics
 SIGNIFICANCE = 1e-4
@@ -189,7 +192,7 @@ class MappedFeatures:
 
     def candidates(
         self, query: RigQuery, kind: int, rig_from_world: Floats, references: Sequence[int], radius_deg: float
-    ) -> Iterator["Candidates"]:
+    ) -> Iterator[Candidates]:
         """Yield, for each query image, candidate matches of its keypoints with map points that project near them.
 
         Args:
@@ -250,7 +253,7 @@ class MappedFeatures:
             order = np.argsort(near_point * len(features) + keypoint - (bits << 32))
             near_point, keypoint = near_point[order], keypoint[order]
             pixels = features.keypoints[keypoint].astype(np.float64)
-            yield Candidates(Matches(np.full(len(good), camera), pixels, point[near_point]), keypoint)
+            yield Matches(np.full(len(good), camera), pixels, point[near_point]), keypoint
 
 
 def _similarities(
@@ -267,17 +270,6 @@ def _similarities(
         unit_b.take(rows_b[pairs], axis=0, out=b[some], mode="clip")
         np.einsum("kd,kd->k", a[some], b[some], out=scores[pairs])
     return scores
-
-
-class Candidates(NamedTuple):
-    """K candidate matches of a query image and one kind of features, highest score first.
-
-    A keypoint or a point may be in several of them.
-    """
-
-    matches: Matches
-    keypoint: Ints
-    """(K,) index of the keypoint in the query image."""
 
 
 def _is_first(numbers: Ints) -> NDArray[np.bool_]:
@@ -309,8 +301,8 @@ class Vicinity:
         """
         self._query, self._candidates, self._points, self._radius_deg = query, candidates, points, radius_deg
         # A point has several candidates, but is projected once.
-        unique = [np.unique(group.matches.point, return_index=True, return_inverse=True) for group in candidates]
-        self._once = [group.matches[first] for group, (_, first, _) in zip(candidates, unique, strict=True)]
+        unique = [np.unique(matches.point, return_index=True, return_inverse=True) for matches, _ in candidates]
+        self._once = [matches[first] for (matches, _), (_, first, _) in zip(candidates, unique, strict=True)]
         self._which = [which for _, _, which in unique]
         self._projected = self._project(rig_from_world)
 
@@ -330,10 +322,11 @@ class Vicinity:
             limit: largest number of matches per camera and kind; those with the highest scores stay.
         """
         chosen = []
-        for projected, which, group in zip(self._project(rig_from_world), self._which, self._candidates, strict=True):
-            near = np.flatnonzero(self._near(projected[which], group.matches.pixels, group.matches, radius_deg))
-            mutual = near[_is_first(group.keypoint[near]) & _is_first(group.matches.point[near])]
-            chosen.append(group.matches[mutual[:limit]])
+        of_groups = zip(self._project(rig_from_world), self._which, self._candidates, strict=True)
+        for projected, which, (matches, keypoint) in of_groups:
+            near = np.flatnonzero(self._near(projected[which], matches.pixels, matches, radius_deg))
+            mutual = near[_is_first(keypoint[near]) & _is_first(matches.point[near])]
+            chosen.append(matches[mutual[:limit]])
         return Matches.pooled(chosen)
 
     def _project(self, rig_from_world: Floats) -> list[Floats]:
@@ -388,7 +381,7 @@ class MapMatcher:
     def vicinity(self, query: RigQuery, rig_from_world: Floats, images: Ints, radius_deg: float) -> Vicinity:
         """Return the candidate matches around a pose with the points of map images."""
         candidates = [
-            Candidates(replace(matches, point=matches.point + int(self._first_point[kind])), keypoint)
+            (replace(matches, point=matches.point + int(self._first_point[kind])), keypoint)
             for kind, features in enumerate(self.mapped)
             for matches, keypoint in features.candidates(
                 query, kind, rig_from_world, self._of_kind(kind, images), radius_deg

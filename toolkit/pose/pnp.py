@@ -744,7 +744,6 @@ def _best_first(hypotheses: Sequence[_Hypothesis]) -> list[_Hypothesis]:
 
 
 def _differ(hypothesis: _Hypothesis, other: _Hypothesis | Rival) -> bool:
-    """Tell whether two hypotheses are clearly different poses."""
     return not agree(hypothesis.world_from_rig, other.world_from_rig, RIVAL_DISTANCE)
 
 

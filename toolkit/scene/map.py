@@ -647,8 +647,9 @@ class Map:
     @property
     def refined_poses(self) -> dict[str, Floats]:
         """Pose (4, 4) of each map image by its name, if the map was built with refined poses; else empty."""
-        refined = self._first and self.settings.map is not None and self.settings.map.refine_poses
-        return self._first.poses if self._first and refined else {}
+        if not self._first or self.settings.map is None or not self.settings.map.refine_poses:
+            return {}
+        return dict(zip(self._first.image_names, self._first.world_from_cams, strict=True))
 
     @cached_property
     def cameras(self) -> MapCameras:
