@@ -243,7 +243,6 @@ class FeedForwardLocalizer(Localizer):
         return View(name, self._session.image_path(row), self.map.cameras[index], True, int(self._turns[row]))
 
     def _choose(self, references: References) -> Ints:
-        """Choose the references of one query image."""
         in_map = references.images < len(self.map.image_names)  # larger indices are images of other kinds of features
         candidates = references.images[in_map]
         if not len(candidates):

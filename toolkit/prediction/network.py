@@ -351,7 +351,6 @@ class NetworkPredictor:
 
         Other threads decode the next images in the meantime, except those whose encoding is cached.
         """
-
         views = {placed.key: placed for batch in batches for group in batch for placed in group}
         unread = {key: placed for key, placed in views.items() if key not in self._cache}
         decoded = prefetch(self._read, list(unread.values()), workers=default_workers(), ahead=_IMAGES_AT_A_TIME)
@@ -445,7 +444,6 @@ class NetworkPredictor:
             return run(tokens)
 
     def _heads(self, size: Size, tokens: "Tensor") -> "Tensor":
-        """Return the network's outputs (B, S, 9 + 2 H W) on the CPU for tokens (B, S, P, C) of images (H, W)."""
         import torch
 
         images = torch.empty(*tokens.shape[:2], 3, *size, device="meta")

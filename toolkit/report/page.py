@@ -191,7 +191,6 @@ def _stages(run: dict[str, Any], run_dir: Path) -> Markup:
 
 
 def _not_done(run: dict[str, Any]) -> Markup:
-    """List the items that stages left out, and why."""
     items = [(row, item) for row in run["stages"] for item in row.get("left_out") or ()]
     columns = ["scene", "what", "reason", "stages"]
     rows = [(row.get("scene"), item.get("what"), item.get("reason"), row.get("stage")) for row, item in items]
@@ -435,7 +434,6 @@ def _steps(sequences: pd.DataFrame, thresholds: list[str]) -> Markup:
 
 
 def _changes(changes: pd.DataFrame, unit: str) -> Markup:
-    """List queries that the sequence stage broke or rescued."""
     if not len(changes):
         return Markup()
     shown = changes.sort_values("change", kind="stable")[:WORST]
@@ -467,7 +465,6 @@ def _losses(losses: pd.DataFrame) -> Markup:
 
 
 def _failures(queries: pd.DataFrame) -> Markup:
-    """Count the queries without a pose by reason."""
     failed = queries[statuses(queries["status"]) == Status.FAILED] if len(queries) else queries
     if not len(failed):
         return Markup()
@@ -483,7 +480,6 @@ def _failures(queries: pd.DataFrame) -> Markup:
 
 
 def _wrong_ok(errors: pd.DataFrame, unit: str) -> Markup:
-    """List the poses that are called ok but are wrong, the largest errors first."""
     if not len(errors):
         return Markup()
     called_ok = errors[statuses(errors["status"]) == Status.OK]
