@@ -378,8 +378,13 @@ class MapMatcher:
             matches.append(Matches(camera_index, query.pixels(camera_index, keypoint, kind), point))
         return Matches.pooled(matches)
 
-    def vicinity(self, query: RigQuery, rig_from_world: Floats, images: Ints, radius_deg: float) -> Vicinity:
-        """Return the candidate matches around a pose with the points of map images."""
+    def vicinity(self, query: RigQuery, rig_from_world: Floats, points: Ints, radius_deg: float) -> Vicinity:
+        """Return the candidate matches around a pose with the points of the map images that observe the most of some
+        points, at most `MAX_GUIDED_IMAGES`.
+        """
+        counts = self.map.images_seeing(np.unique(points))
+        images = np.flatnonzero(counts)
+        images = images[np.argsort(-counts[images], kind="stable")[:MAX_GUIDED_IMAGES]]
         candidates = [
             (replace(matches, point=matches.point + int(self._first_point[kind])), keypoint)
             for kind, features in enumerate(self.mapped)
@@ -388,12 +393,6 @@ class MapMatcher:
             )
         ]
         return Vicinity(query, candidates, self.map.points, rig_from_world, radius_deg)
-
-    def covisible(self, points: Ints) -> Ints:
-        """Return the map images that observe the most of some points, most first, at most `MAX_GUIDED_IMAGES`."""
-        counts = self.map.images_seeing(points)
-        images = np.flatnonzero(counts)
-        return images[np.argsort(-counts[images], kind="stable")[:MAX_GUIDED_IMAGES]]
 
     def kind_names(self, points: Ints) -> NDArray[np.str_]:
         """Return the name of the kind of features of each point."""
