@@ -170,9 +170,7 @@ def room() -> World:
     return World.build(np.random.default_rng(0).uniform([-4, -2.5, 3.5], [4, 2.5, 8], (1200, 3)), MAP_POSES)
 
 
-def check(
-    estimate: QueryResult, true: Floats, max_deg: float = 0.1, max_m: float = 0.01, status: str = "ok"
-) -> None:
+def check(estimate: QueryResult, true: Floats, max_deg: float = 0.1, max_m: float = 0.01, status: str = "ok") -> None:
     assert estimate.status == status
     assert estimate.world_from_rig is not None
     rotation_deg, distance_m = geometry.pose_error(estimate.world_from_rig, true)
