@@ -11,6 +11,7 @@ from toolkit import visualize
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, CaptureError
 from toolkit.figures.style import new_figure
+from toolkit.geometry import pose_error
 from toolkit.results.pair import query_group
 from toolkit.visualize import sample_pictures, visualize_scene
 
@@ -57,10 +58,13 @@ def test_the_worst_come_first_by_error_and_pictures_show_their_own_inliers(small
         ["ios", "ios", 3, 3],
         ["ios", "hl", 1, 1],
     ]
-    worst = [round(query.translation, 6) for query in drawn["worst"]]
+    cameras = [details.cameras[0] for _, details in drawn["worst"]]
+    worst = [round(float(pose_error(one.world_from_cam, one.world_from_cam_true)[1]), 6) for one in cameras]
     assert worst == [0.3, 0.2, 0.1, 0.0]
-    assert drawn["worst"][0].reason == "ok, 2 inliers"
-    np.testing.assert_array_equal(drawn["worst"][0].details.cameras[0].pixels, queries[1].correspondences.pixels)
+    pairs = [caption.partition(": off by ")[0] for caption, _ in drawn["worst"]]
+    assert pairs == [f"{device} in the ios map" for device in ("ios", "hl", "ios", "ios")]
+    assert drawn["worst"][0][0].endswith("°, 30 cm; ok, 2 inliers")
+    np.testing.assert_array_equal(cameras[0].pixels, queries[1].correspondences.pixels)
     assert [query.cameras[0].num_agreeing for query in drawn["samples"]] == [2, 1, 1]
     assert sorted(drawn["recorded"][0]) == [1, 2]
     np.testing.assert_allclose(drawn["recorded"][0][2].cameras[0].points, queries[2].correspondences.points)
@@ -79,9 +83,9 @@ def test_without_truth_the_weakest_are_shown_not_the_strongest(small_capture, dr
         status=["ok", "failed: too few inliers", "low_confidence"], num_inliers=[593, 3, 20], num_matches=[900, 9, 30],
     )  # fmt: skip
     visualize_scene(tmp_path / "SMALL" / "sessions", poses, None, tmp_path / "out", QUICK)
-    reasons = [query.reason for query in drawn["worst"]]
-    failed = "failed: too few inliers, 9 matches, 3 inliers"
-    assert reasons == [failed, "low_confidence, 30 matches, 20 inliers", "ok, 900 matches, 593 inliers"]
+    captions, failed = [caption for caption, _ in drawn["worst"]], "failed: too few inliers, 9 matches, 3 inliers"
+    reasons = [failed, "low_confidence, 30 matches, 20 inliers", "ok, 900 matches, 593 inliers"]
+    assert captions == [f"ios in the ios map: {reason}" for reason in reasons]
     assert sorted(drawn["recorded"][0]) == [1, 2]
 
 

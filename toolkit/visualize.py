@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 from toolkit.capture import Capture
 from toolkit.errors import ArtifactError, DamagedError
 from toolkit.figures.evaluation import SequencePair, draw_sequence, warn_of_older
-from toolkit.figures.query_images import WorstQuery, draw_localization, draw_worst
+from toolkit.figures.query_images import draw_localization, draw_worst, off_by
 from toolkit.figures.style import rendered, save_figure, save_picture
 from toolkit.figures.top_view import draw_scene
 from toolkit.files import RAW_DATA, pair_name, require_current, sidecar_path, write_sidecar
@@ -218,6 +218,7 @@ def _draw_worst(path: Path, scene: str, candidates: pd.DataFrame) -> None:
             reason.append(f"{row['num_matches']:.0f} matches")
         reason += filter(None, [support_of(row)])
         errors = row["rotation_error_deg"], row["translation_error_m"]
-        shown.append(WorstQuery(row["pair"], ", ".join(reason), row["details"], *errors, row["unit"]))
+        off = f"{off_by(*errors, row['unit'])}; " if np.isfinite(errors[1]) else ""
+        shown.append((f"{row['pair']}: {off}{', '.join(reason)}", row["details"]))
     title = f"{scene}: the {len(shown)} worst queries, each in the map in which it went worst"
     save_figure(draw_worst(shown, title), path, title)

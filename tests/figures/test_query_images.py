@@ -7,7 +7,7 @@ from PIL import Image
 
 from tests.displayed import picture_of
 from toolkit.capture.upright import up_of_cameras
-from toolkit.figures.query_images import WorstQuery, draw_localization, draw_worst, shown_name
+from toolkit.figures.query_images import draw_localization, draw_worst, off_by, shown_name
 from toolkit.figures.style import error_colors, new_figure, save_figure
 from toolkit.figures.top_view import draw_scene
 from toolkit.geometry import make_pose, project
@@ -146,13 +146,13 @@ def test_the_worst_queries_are_drawn_with_the_matches_they_share_with_a_referenc
     gone = ShownImage("x", tmp_path / "gone.jpg", CAMERA, np.eye(4))
     unmatched = ShownImage("q", query.image, CAMERA, np.eye(4))
     worst = [
-        WorstQuery("hl in the ios map", "failed: too few matches, 3 matches", QueryDetails([query])),
-        WorstQuery("hl in the ios map", "ok, 5 matches", QueryDetails([imported], [reference]), 2.0, 0.5),
-        WorstQuery("hl in the ios map", "ok", QueryDetails([query], [gone]), 1.0, 0.1),
-        WorstQuery("hl in the ios map", "ok", QueryDetails([unmatched], [], [reference])),
+        ("hl in the ios map: failed: too few matches, 3 matches", QueryDetails([query])),
+        (f"hl in the ios map: {off_by(2.0, 0.5, 'm')}; ok, 5 matches", QueryDetails([imported], [reference])),
+        ("hl in the ios map: ok", QueryDetails([query], [gone])),
+        ("hl in the ios map: ok", QueryDetails([unmatched], [], [reference])),
     ]
     deep = replace(query, name=f"s/raw_data/{'folder/' * 12}{'8' * 80}.jpg")
-    worst[2] = replace(worst[2], details=QueryDetails([deep], [gone]))
+    worst[2] = worst[2][0], QueryDetails([deep], [gone])
     figure = draw_worst(worst, "the worst")
     first, second, third, fourth = figure.axes[:4]
     assert first.get_title(loc="left").startswith("1. hl in the ios map: failed: too few matches")

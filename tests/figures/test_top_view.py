@@ -1,15 +1,16 @@
 import numpy as np
 
-from toolkit.figures.top_view import ground_axes, places_of
+from toolkit.figures.top_view import Ground, places_of
 
 
 def test_ground_axes_are_seen_from_above():
+    none = np.zeros((0, 4, 4))
     for up in ([0, 0, -1], [0, 1, 0], [0.1, 0.2, 0.9]):
-        axes, labels = ground_axes(up)
-        np.testing.assert_allclose(np.cross(*axes), up / np.linalg.norm(up), atol=1e-12)
-        assert len(labels) == 2
-    assert ground_axes([0, 0, -1])[1] == ["x [m]", "−y [m]"]
-    assert ground_axes([0, 0, -1], None)[1] == ["x", "−y"]
+        ground = Ground.below(none, up)
+        np.testing.assert_allclose(np.cross(*ground.axes), up / np.linalg.norm(up), atol=1e-12)
+        assert len(ground.labels) == 2
+    assert Ground.below(none, [0, 0, -1]).labels == ["x [m]", "−y [m]"]
+    assert Ground.below(none, [0, 0, -1], (None, 1.0)).labels == ["x", "−y"]
 
 
 def test_far_apart_places_are_told_apart():

@@ -10,12 +10,14 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 import numpy as np
+import pycolmap
 import pytest
 import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from toolkit.errors import ImageError, WeightsError
+from toolkit.geometry import invert, make_pose, transform
 from toolkit.models.multiview import add_position, dense_output
 from toolkit.models.vggt import (
     HEADS,
@@ -24,9 +26,9 @@ from toolkit.models.vggt import (
     Views,
     cameras_from_pose_encoding,
     load_images,
-    unproject_depth,
 )
 from toolkit.models.vit import places_of_view, rope_of_places, rotate_
+from toolkit.prediction.depths import lifted
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 H, W = 42, 56
@@ -365,10 +367,23 @@ def test_pose_encoding_known_answers() -> None:
         cameras_from_pose_encoding(np.zeros(9), (100, 200))
 
 
+def unprojected(depth: Any, cam_from_world: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """World points (S, H, W, 3) of depth maps (S, H, W, 1), by cameras of the toolkit: the first pixel is at 0.5."""
+    depth = np.asarray(depth, np.float64)
+    height, width = depth.shape[1:3]
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2) + 0.5
+    points = []
+    for z, pose, K in zip(depth, cam_from_world, intrinsics, strict=True):
+        params = [K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5]
+        camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
+        points.append(transform(invert(make_pose(pose[:, :3], pose[:, 3])), lifted(camera, pixels, z.ravel())))
+    return np.reshape(points, (*depth.shape[:3], 3))
+
+
 def test_unprojected_points_project_back() -> None:
     cam_from_world, K, _ = random_cameras(3)
     depth = np.random.default_rng(1).uniform(1, 5, (3, 6, 8, 1))
-    world = unproject_depth(torch.from_numpy(depth), cam_from_world, K)
+    world = unprojected(torch.from_numpy(depth), cam_from_world, K)
     assert world.shape == (3, 6, 8, 3)
     for pose, k, z, points in zip(cam_from_world, K, depth, world, strict=True):
         projected = (points @ pose[:, :3].T + pose[:, 3]) @ k.T
@@ -514,7 +529,7 @@ def test_official_numbers(golden: ModuleType) -> None:
         bias.copy_(kept)
         outputs = {name: value.numpy() for name, value in outputs.items()}
         pose, K = cameras_from_pose_encoding(output["pose_enc"], images.shape[2:])
-        points = unproject_depth(output["depth"][0], pose[0], K[0])
+        points = unprojected(output["depth"][0], pose[0], K[0])
         outputs |= {"extrinsic": pose, "intrinsic": K, "unprojected": points}
         recorded = json.loads((golden.HERE / "vggt.golden.json").read_text())["cases"][case]["outputs"]
         assert recorded.keys() <= outputs.keys()

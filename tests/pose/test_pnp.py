@@ -170,9 +170,7 @@ def room() -> World:
     return World.build(np.random.default_rng(0).uniform([-4, -2.5, 3.5], [4, 2.5, 8], (1200, 3)), MAP_POSES)
 
 
-def check(
-    estimate: QueryResult, true: Floats, max_deg: float = 0.1, max_m: float = 0.01, status: str = "ok"
-) -> None:
+def check(estimate: QueryResult, true: Floats, max_deg: float = 0.1, max_m: float = 0.01, status: str = "ok") -> None:
     assert estimate.status == status
     assert estimate.world_from_rig is not None
     rotation_deg, distance_m = geometry.pose_error(estimate.world_from_rig, true)
@@ -355,8 +353,8 @@ def test_a_query_from_elsewhere_is_not_ok(room: World, seed: int) -> None:
 def test_a_keypoint_near_a_point_is_one_candidate_by_its_best_image(room: World) -> None:
     seen, (mapped,) = room.look(PINHOLE, QUERY), room.localizer().matcher.mapped
     query = RigQuery([PINHOLE], np.eye(4)[None], [[seen]])
-    (group,) = mapped.candidates(query, 0, geometry.invert(QUERY), REFERENCES, 1.0)
-    pairs = np.column_stack([group.keypoint, group.matches.point])
+    ((matches, keypoint),) = mapped.candidates(query, 0, geometry.invert(QUERY), REFERENCES, 1.0)
+    pairs = np.column_stack([keypoint, matches.point])
     assert len(np.unique(pairs, axis=0)) == len(pairs) > 500
     unit, best = unit_descriptors(seen.descriptors, mapped.kind.shorten), np.full(len(pairs), -1.0)
     for image in map(mapped.image, REFERENCES):

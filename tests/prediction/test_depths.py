@@ -112,7 +112,7 @@ def test_without_the_sensors_own_time_depth_would_be_wrong(tmp_path: Path) -> No
     """The check above tells a pose at the photograph's time from one at the depth map's."""
     made = record(tmp_path / "ios_map")
     maps = DepthMaps(made.session)
-    maps._tracks["tof"] = (np.array([TIME + OFFSET]), (moving(0.0) @ RIG_FROM_DEPTH)[None])
+    maps._track_of = lambda _: (np.array([TIME + OFFSET]), (moving(0.0) @ RIG_FROM_DEPTH)[None])
     assert np.nanmean(relative_errors(maps.of(0), made.depth_m) < 0.02) < 0.9
 
 

@@ -537,7 +537,7 @@ def fuse(similarities: Sequence[Any]) -> Any:
         return count / sum(1 / (_GAMMA + scores / count).clip(min=0) for scores in similarities) - _GAMMA
 
 
-def _fused(query: Any, vectors: Any, dims: Sequence[int], product: Callable[[Any, Any], Any]) -> Any:
+def fused_products(query: Any, vectors: Any, dims: Sequence[int], product: Callable[[Any, Any], Any]) -> Any:
     """Return the products of queries (..., D) and vectors (..., D), fused if there are several descriptors."""
     if len(dims) < 2:
         return product(query, vectors)
@@ -595,7 +595,7 @@ def _rank_candidates(
         if not len(rows):
             continue
         block, k = np.asarray(vectors[rows], np.float32), min(scores.shape[1], len(rows))
-        rough = _fused(vector, block, dims, lambda a, b: b @ a)
+        rough = fused_products(vector, block, dims, lambda a, b: b @ a)
         tolerance = _tolerance(np.linalg.norm(block, axis=1).max() * np.linalg.norm(vector), dims)
         near = rough >= np.partition(rough, -k)[-k] - 2 * tolerance
         exact = _products(np.broadcast_to(vector, (int(near.sum()), len(vector))), block[near], dims)
@@ -606,7 +606,7 @@ def _rank_candidates(
 def _products(query: _Floats, vectors: _Floats, dims: Sequence[int]) -> _Floats:
     """Return the row by row dot products (n,) of two (n, D) arrays, summed and fused in float64."""
     wide = query.astype(np.float64), vectors.astype(np.float64)
-    fused: NDArray[np.float64] = _fused(*wide, dims, partial(np.einsum, "nd,nd->n"))
+    fused: NDArray[np.float64] = fused_products(*wide, dims, partial(np.einsum, "nd,nd->n"))
     return fused.astype(np.float32)
 
 
@@ -689,7 +689,7 @@ def _torch_backend(query: _Floats, masks: Masks | None, compute_device: str, dim
                 part, allowed = first + np.flatnonzero(some), allowed[some]
                 if not len(part):
                     continue
-            products = _fused(queries[part], rows, dims, lambda a, b: a @ b.T)
+            products = fused_products(queries[part], rows, dims, lambda a, b: a @ b.T)
             if allowed is not None:
                 products.masked_fill_(torch.from_numpy(~allowed).to(device), -torch.inf)
             scores[part], indices[part] = (best.cpu().numpy() for best in products.topk(number))

@@ -51,10 +51,7 @@ LABELS = {
     "rotation_std_deg": ("std. dev. of rotation [deg]", "{:.2g}"), "scale_std": ("std. dev. of scale", "{:.1%}"),
 }  # fmt: skip
 """Numbers about a pose, attributes of a result: label and format of each; `{unit}` stands for the unit of lengths."""
-OF_MATCHES = (
-    "num_matches", "num_inliers", "inlier_ratio", "num_guided", "rmse_px", "coverage", "p_correct", "rival_support",
-    "agreement",
-)  # fmt: skip
+OF_MATCHES = {name for name in LABELS if not name.endswith(("std", "std_deg"))}
 """Numbers that a pose without matches does not have."""
 STATUS_COLORS = {Status.OK: GREEN, Status.LOW_CONFIDENCE: ORANGE, Status.FAILED: VERMILLION}
 SURE = 2.4477

@@ -17,7 +17,7 @@ from toolkit.figures.query_images import draw_image
 from toolkit.figures.style import GREEN, ORANGE, VERMILLION, new_figure, plain_log, shared_legend, styled
 from toolkit.figures.top_view import Ground, Layer, draw_places
 from toolkit.files import image_name, pair_devices, read_references
-from toolkit.geometry import Floats, qt_from_pose, unit
+from toolkit.geometry import Floats, qt_from_pose
 from toolkit.pose.base import Status, short_status, statuses
 from toolkit.results.metrics import is_posed
 from toolkit.results.pair import PairResults
@@ -139,7 +139,7 @@ def draw_similarity(embeddings: str | Path, limit: int = 300) -> "Figure":
 
     Sessions are thinned evenly to at most `limit` images.
     """
-    from toolkit.embedders.search import fuse  # loads FAISS
+    from toolkit.embedders.search import fused_products  # loads FAISS
 
     first = next(iter(embedding_folders(embeddings).values()))
     sessions = [folder.name for folder in sorted(first.iterdir()) if folder.is_dir()]
@@ -147,14 +147,14 @@ def draw_similarity(embeddings: str | Path, limit: int = 300) -> "Figure":
     maps = [name for name in sessions if name.endswith("_map")] or sessions
     of_others = (name for name in maps if name.rpartition("_")[0] != query.rpartition("_")[0])
     map_id = next(of_others, maps[0])
-    rows, columns = (_descriptors(Path(embeddings), session, limit) for session in (query, map_id))
-    products = [row @ column.T for row, column in zip(rows, columns, strict=True)]
+    opened = [open_descriptors(embeddings, session, normalize=True)[0] for session in (query, map_id)]
+    rows, columns = (vectors[:: max(1, -(-len(vectors) // limit))] for vectors in opened)
+    values = fused_products(rows, columns, opened[0].dims, lambda a, b: a @ b.T)
     figure = new_figure(8, 4.5)
     plot = figure.subplots()
-    values = products[0] if len(products) == 1 else fuse(products)
     image = plot.imshow(values, aspect="auto", interpolation="nearest", cmap="viridis")
     plot.set(xlabel=f"images of {map_id}", ylabel=f"images of {query}")
-    figure.colorbar(image, label="cosine similarity" if len(products) == 1 else "fused similarity")
+    figure.colorbar(image, label="cosine similarity" if len(opened[0].dims) == 1 else "fused similarity")
     return figure
 
 
@@ -226,19 +226,6 @@ def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
     plot.set_xlabel("inliers of a query (log scale; none at the left edge)")
     figure.legend(fontsize=8, loc="outside lower center", ncols=3)
     return figure
-
-
-def _descriptors(embeddings: Path, session: str, limit: int) -> list[NDArray[np.float32]]:
-    """Return each kind of unit descriptors of a session, (N <= limit, D)."""
-    if len(embedding_folders(embeddings)) > 1:
-        vectors, _ = open_descriptors(embeddings, session, normalize=True)
-        chosen = vectors[:: max(1, -(-len(vectors) // limit))]
-        return np.split(chosen, np.cumsum(vectors.dims)[:-1], axis=1)
-    parts = [np.load(file, mmap_mode="r") for file in sorted((embeddings / session).rglob("*.npy"))]
-    total = sum(len(part) for part in parts)
-    step = max(1, -(-total // limit))
-    rows = np.concatenate([np.asarray(part[::step], np.float32) for part in parts])
-    return [unit(rows)]
 
 
 def _empty(why: str) -> "Figure":

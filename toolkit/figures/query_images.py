@@ -1,16 +1,17 @@
 """Draw queries beside their references, with the matches between them."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
 
 from toolkit.capture.images import read_for_display
-from toolkit.figures.style import ESTIMATED, GREEN, SKY, inches_to_pixels, new_figure, styled
+from toolkit.figures.style import ESTIMATED, GREEN, SKY, new_figure, styled
 from toolkit.files import own_name
 from toolkit.geometry import Floats, pose_error, project
 from toolkit.pose.base import Query
@@ -76,7 +77,8 @@ def draw_image(
         height, ratio = image.camera.height if height is None else height, image.ratio
         extent, inches = (left, left + height * ratio, height, 0), inches * max(1.0, ratio)
         image = image.image
-    pixels = read_for_display(image, inches_to_pixels(inches)) if isinstance(image, Path) else image
+    in_file = math.ceil(inches * mpl.rcParams["savefig.dpi"])
+    pixels = read_for_display(image, in_file) if isinstance(image, Path) else image
     axis.imshow(pixels, cmap="gray", extent=extent, interpolation="antialiased")
     for side in (axis.xaxis, axis.yaxis):
         side.set_visible(False)  # a layout also measures axes without ticks
@@ -222,29 +224,14 @@ def draw_localization(query: QueryDetails, title: str = "", unit: tuple[str, flo
         draw_matches(panel, image, 4)
     if located and is_posed(shown.world_from_cam_true):
         rotation_deg, distance = map(float, pose_error(shown.world_from_cam, shown.world_from_cam_true))
-        title = f"{title}{' · ' if title else ''}{_off_by(rotation_deg, distance / unit[1], unit[0])}"
+        title = f"{title}{' · ' if title else ''}{off_by(rotation_deg, distance / unit[1], unit[0])}"
     figure.suptitle(title)
     return figure
 
 
-@dataclass(frozen=True)
-class WorstQuery:
-    """A query on the sheet of the worst queries."""
-
-    pair: str
-    reason: str
-    """Status and counts of matches."""
-    details: QueryDetails
-    rotation_deg: float = np.nan
-    translation: float = np.nan
-    """Its errors; NaN without a pose or ground truth."""
-    unit: str = "m"
-    """Unit of lengths."""
-
-
 @styled
-def draw_worst(queries: Sequence[WorstQuery], title: str = "The worst queries") -> "Figure":
-    """Draw queries, the worst first, each beside its best reference with lines between common points."""
+def draw_worst(queries: Sequence[tuple[str, QueryDetails]], title: str = "The worst queries") -> "Figure":
+    """Draw queries, a caption and details each, beside their best references, with lines between common points."""
     columns = 2 if len(queries) > 1 else 1
     rows = max(1, -(-len(queries) // columns))
     figure = new_figure(6.0 * columns, 2.75 * rows + 0.8)
@@ -253,22 +240,21 @@ def draw_worst(queries: Sequence[WorstQuery], title: str = "The worst queries") 
         axis.set_axis_off()
     if not len(queries):
         panels[0].text(0.5, 0.5, "no queries", ha="center")
-    for rank, (axis, query) in enumerate(zip(panels, queries, strict=False), start=1):
-        draw_joined(axis, query.details, 2.2)
-        image, references = query.details.cameras[0], query.details.captioned_references()
+    for rank, (axis, (caption, query)) in enumerate(zip(panels, queries, strict=False), start=1):
+        draw_joined(axis, query, 2.2)
+        image, references = query.cameras[0], query.captioned_references()
         if references and not image.agrees[np.isin(image.matches, references[0][0].matches)].any():
-            text = "no common points" if query.details.has_matches else f"no matches; {references[0][1]}"
+            text = "no common points" if query.has_matches else f"no matches; {references[0][1]}"
             box = {"facecolor": "black", "alpha": 0.6, "lw": 0, "pad": 2}
             axis.text(0.5, 0.04, text, ha="center", color="white", fontsize=8, bbox=box, transform=axis.transAxes)
-        has_error = np.isfinite(query.translation)
-        off = f"{_off_by(query.rotation_deg, query.translation, query.unit)}; " if has_error else ""
-        text = f"{rank}. {query.pair}: {off}{query.reason}\n{shown_name(image.name, MAX_LETTERS)}"
+        text = f"{rank}. {caption}\n{shown_name(image.name, MAX_LETTERS)}"
         axis.set_title(text, fontsize=8, loc="left", wrap=True)
     legend = "left: query, right: its best reference; lines: agreeing (green) and rejected matches (orange) of both"
     figure.suptitle(f"{title}\n({legend})")
     return figure
 
 
-def _off_by(rotation_deg: float, length: float, unit: str) -> str:
+def off_by(rotation_deg: float, length: float, unit: str) -> str:
+    """Return the errors of a pose, in degrees and a unit of lengths, as a text such as `off by 2°, 50 cm`."""
     small = f"{100 * length:.2g} cm" if unit == "m" and length < 0.995 else f"{length:.3g} {unit}"
     return f"off by {rotation_deg:.{2 if rotation_deg < 99.5 else 3}g}°, {small}"

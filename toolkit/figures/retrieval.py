@@ -135,7 +135,7 @@ class RetrievedPair:
 
     def _similarities(self, row: int, references: Sequence[int]) -> tuple[Ints, Floats]:
         """Return the rows of posed map images in order, all `references` among them, and the query's similarities."""
-        from toolkit.embedders.search import fuse  # loads FAISS
+        from toolkit.embedders.search import fused_products  # loads FAISS
 
         session, row_of_name = self.map_session, self.map_session.row_of_name
         queries, query_table = open_descriptors(self.embeddings, self.session.id, normalize=True)
@@ -151,11 +151,8 @@ class RetrievedPair:
         usable = usable[np.lexsort(taken)]
         sampled = np.arange(len(usable)) % max(1, -(-len(usable) // MAX_COMPARED)) == 0
         usable = usable[sampled | np.isin(rows[usable], references)]
-        cuts, ascending = np.cumsum(vectors.dims)[:-1], np.sort(usable)
-        query = np.split(queries[query_rows[:1]], cuts, axis=1)
-        parts = np.split(vectors[ascending], cuts, axis=1)
-        products = [part @ one[0] for part, one in zip(parts, query, strict=True)]
-        values = np.asarray(products[0] if len(products) == 1 else fuse(products), np.float64)
+        ascending, (query,) = np.sort(usable), queries[query_rows[:1]]
+        values = fused_products(query, vectors[ascending], vectors.dims, lambda a, b: b @ a).astype(np.float64)
         return rows[usable], values[np.searchsorted(ascending, usable)]
 
     def _overlaps(self, row: int, images: Ints) -> Floats:

@@ -58,13 +58,6 @@ def new_figure(width: float, height: float) -> "Figure":
     return figure
 
 
-def inches_to_pixels(inches: float) -> int:
-    """Convert a length in a figure to pixels of its PNG file; call it in a function that is `styled`."""
-    import matplotlib as mpl
-
-    return math.ceil(inches * mpl.rcParams["savefig.dpi"])
-
-
 def picture_of(figure: "Figure") -> bytes:
     """Return a figure as notebooks display and store it: as a JPEG file if that has less than half the size of PNG.
 
@@ -170,23 +163,18 @@ def _as_png(picture: "Image", caption: str = "") -> bytes:
 
 
 def error_scale() -> "tuple[Colormap, LogNorm]":
-    """Return the color map of position errors: perceptually uniform, visible on white and on black."""
+    """Return the color map of position errors: perceptually uniform, visible on white and on black; sky if unknown."""
     import matplotlib as mpl
     from matplotlib.colors import ListedColormap, LogNorm
 
     colors = mpl.colormaps["plasma"](np.linspace(0.25, 0.85, 256))
-    return ListedColormap(colors), LogNorm(*ERROR_RANGE_M, clip=True)
+    return ListedColormap(colors).with_extremes(bad=SKY), LogNorm(*ERROR_RANGE_M, clip=True)
 
 
 def error_colors(errors_m: ArrayLike) -> NDArray[np.uint8]:
     """Return the colors (N, 3) RGB of errors (N,), meters; unknown errors, NaN, are sky blue."""
-    errors = np.asarray(errors_m, np.float64)
     colors, scale = error_scale()
-    finite = np.isfinite(errors)
-    rgb = np.tile(np.array(bytearray.fromhex(SKY[1:]), np.uint8), (len(errors), 1))
-    if finite.any():
-        rgb[finite] = colors(scale(np.maximum(errors[finite], ERROR_RANGE_M[0])), bytes=True)[:, :3]
-    return rgb
+    return colors(scale(np.ma.masked_invalid(np.asarray(errors_m, np.float64))), bytes=True)[:, :3]
 
 
 def error_bar(figure: "Figure", unit: str = "m", **where: Any) -> None:

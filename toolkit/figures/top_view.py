@@ -53,8 +53,24 @@ class Ground:
 
     @classmethod
     def below(cls, poses: Floats, up: ArrayLike | None = None, unit: tuple[str | None, float] = ("m", 1.0)) -> "Ground":
-        """Return the ground below cameras (N, 4, 4); `up`: up direction (3,), None: estimated from the cameras."""
-        return cls(*ground_axes(up_of_cameras(poses) if up is None else up, unit[0]), unit[1])
+        """Return the ground below cameras (N, 4, 4).
+
+        Args:
+            up: up direction (3,); None: estimated from the cameras. If it is a world axis, the two axes of the picture
+                are world axes, so it shows world coordinates.
+            unit: unit of lengths in the picture, None without one, and its length.
+        """
+        upward = np.asarray(up_of_cameras(poses) if up is None else up, np.float64)
+        upward = upward / np.linalg.norm(upward)
+        first = np.eye(3)[0 if np.argmax(np.abs(upward)) != 0 else 1]
+        right = first - upward * (first @ upward)
+        right /= np.linalg.norm(right)
+        axes, labels = np.stack([right, np.cross(upward, right)]), []
+        for row in axes:
+            k = int(np.argmax(np.abs(row)))
+            name = f"{'−' if row[k] < 0 else ''}{'xyz'[k]}" if abs(row[k]) > 0.99 else "along the ground"
+            labels.append(f"{name} [{unit[0]}]" if unit[0] else name)
+        return cls(axes, labels, unit[1])
 
     def flat(self, world: Floats) -> Floats:
         """Return positions (..., 2) in the picture of world positions (..., 3) or poses (..., 4, 4)."""
@@ -233,25 +249,6 @@ def draw_scene(
     shared_legend(figure, axes, ncols=5, frameon=False, fontsize=9)
     figure.suptitle(title)
     return figure
-
-
-def ground_axes(up: ArrayLike, unit: str | None = "m") -> tuple[Floats, list[str]]:
-    """Return the right and the upward axis of a figure from above, (2, 3), and their labels.
-
-    If `up`, (3,), is a world axis, the two are world axes, so the figure shows world coordinates.
-    """
-    up = np.asarray(up, np.float64) / np.linalg.norm(up)
-    axis = int(np.argmax(np.abs(up)))
-    first = np.eye(3)[0 if axis != 0 else 1]
-    right = first - up * (first @ up)
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(up, right)])
-    labels, in_unit = [], f" [{unit}]" if unit else ""
-    for row in axes:
-        k = int(np.argmax(np.abs(row)))
-        sign = "−" if row[k] < 0 else ""
-        labels.append((f"{sign}{'xyz'[k]}" if abs(row[k]) > 0.99 else "along the ground") + in_unit)
-    return axes, labels
 
 
 def places_of(positions: Floats) -> Ints:

@@ -102,11 +102,6 @@ class LocalMap:
         """Index of each image by its name."""
         return {name: index for index, name in enumerate(self.image_names)}
 
-    @property
-    def poses(self) -> dict[str, Floats]:
-        """Pose (4, 4) of each image by its name."""
-        return dict(zip(self.image_names, self.world_from_cams, strict=True))
-
     @cached_property
     def cams_from_world(self) -> Floats:
         return geometry.invert(self.world_from_cams)

@@ -26,12 +26,11 @@ from toolkit.models.multiview import (
     Source,
     Views,
     dense_output,
-    unproject_depth,
 )
 from toolkit.models.vit import PATCH, Dinov2, normalized, places_of_view, rope_of_places, set_matrix_type
 from toolkit.models.weights import read_state_dict
 
-__all__ = ["HEADS", "MODES", "DepthAnything3", "Views", "cameras_from_pose_encoding", "load_images", "unproject_depth"]
+__all__ = ["HEADS", "MODES", "DepthAnything3", "Views", "cameras_from_pose_encoding", "load_images"]
 
 HEADS = ("camera", "depth")
 SIDE = 504

@@ -336,28 +336,6 @@ def cameras_from_pose_encoding(pose_enc: ArrayLike, size: tuple[int, int]) -> tu
     return np.concatenate([rotation, encoding[..., :3, None]], axis=-1), intrinsics
 
 
-def unproject_depth(depth: ArrayLike, cam_from_world: ArrayLike, intrinsics: ArrayLike) -> Floats:
-    """Return the world point of each pixel of depth maps, (S, H, W, 3).
-
-    As in the official code, the center of the top-left pixel is (0, 0) here. Elsewhere in this toolkit it is (0.5,
-    0.5): subtract 0.5 from the principal points of such cameras first.
-
-    Args:
-        depth: (S, H, W) or (S, H, W, 1), along the camera's z.
-        cam_from_world: (S, 3, 4) or (S, 4, 4).
-        intrinsics: K, (S, 3, 3), pixels.
-    """
-    z = np.asarray(depth, np.float64)
-    z = z[..., 0] if z.ndim == 4 else z
-    pose, K = np.asarray(cam_from_world, np.float64), np.asarray(intrinsics, np.float64)
-    v, u = np.indices(z.shape[1:])
-    focal, center = K[:, None, None, [0, 1], [0, 1]], K[:, None, None, :2, 2]
-    rays = (np.stack([u, v], axis=-1) - center) / focal
-    in_camera = np.concatenate([rays * z[..., None], z[..., None]], axis=-1)
-    # Multiplying row vectors by R applies the inverse rotation.
-    return np.einsum("shwi,sij->shwj", in_camera - pose[:, None, None, :3, 3], pose[:, :3, :3])
-
-
 class MultiView(nn.Module):
     """A network for several views of a scene, with a patch encoder that processes each view separately.
 

@@ -25,12 +25,11 @@ from toolkit.models.multiview import (
     add_position,
     cameras_from_pose_encoding,
     dense_output,
-    unproject_depth,
     with_special_tokens,
 )
 from toolkit.models.vit import Block, PatchEmbed, Rope, normalized, set_matrix_type
 
-__all__ = ["HEADS", "MODES", "VGGTOmega", "Views", "cameras_from_pose_encoding", "load_images", "unproject_depth"]
+__all__ = ["HEADS", "MODES", "VGGTOmega", "Views", "cameras_from_pose_encoding", "load_images"]
 
 HEADS = ("camera", "depth")
 SIDE = 512

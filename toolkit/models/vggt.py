@@ -23,7 +23,6 @@ from toolkit.models.multiview import (
     Views,
     cameras_from_pose_encoding,
     dense_output,
-    unproject_depth,
     with_special_tokens,
 )
 from toolkit.models.vit import (
@@ -37,7 +36,7 @@ from toolkit.models.vit import (
     set_matrix_type,
 )
 
-__all__ = ["HEADS", "MODES", "VGGT", "Views", "cameras_from_pose_encoding", "load_images", "unproject_depth"]
+__all__ = ["HEADS", "MODES", "VGGT", "Views", "cameras_from_pose_encoding", "load_images"]
 
 HEADS = ("camera", "depth", "point")
 SIDE = 518

@@ -10,7 +10,7 @@ from enum import StrEnum
 from html import escape
 from pathlib import Path
 from threading import Lock
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pandas as pd
@@ -180,16 +180,6 @@ class Correspondences:
         return len(self.camera)
 
 
-class Context(Protocol):
-    """A query in its map, which its results need to show themselves."""
-
-    @property
-    def answer(self) -> "Callable[[QueryResult], Any]": ...
-    def show_3d(self, results: Sequence["QueryResult"], rays: bool) -> Any: ...
-    @property
-    def what_if(self) -> Callable[..., Any]: ...
-
-
 @dataclass(frozen=True, repr=False)
 class QueryResult:
     """How one query was localized: its pose and how far to trust it, or why it has none."""
@@ -252,8 +242,8 @@ class QueryResult:
     """If fallback features were used: status and reason from the other features alone."""
     first_seconds: float | None = None
     """Time that the pose from the other features took."""
-    context: Context | None = field(default=None, repr=False, compare=False)
-    """The query in its map; None for a result that a `Map` or `Run` did not return."""
+    context: Any = field(default=None, repr=False, compare=False)
+    """The query in its map, `scene.map.Located`; None for a result that a `Map` or `Run` did not return."""
 
     def show(self) -> Any:
         """Return status and reason in words, numbers, matches, references and positions; a notebook shows a figure.
@@ -286,7 +276,7 @@ class QueryResult:
         return {**self.__dict__, "context": None}
 
     @property
-    def _in_map(self) -> Context:
+    def _in_map(self) -> Any:
         if self.context is None:
             raise ArtifactError("This result belongs to no map. To get one that does: Map.locate, or Run.result.")
         return self.context
@@ -741,11 +731,9 @@ class RigQuery:
         if len(np.unique(matches.point)) < 4:
             return None
         if len(matches) > MAX_RANSAC_MATCHES:
-            chosen = np.random.default_rng(seed).permutation(len(matches))
-            kept = np.zeros(len(matches), bool)
-            kept[chosen[:MAX_RANSAC_MATCHES]] = True
+            chosen = np.random.default_rng(seed).permutation(len(matches))[:MAX_RANSAC_MATCHES]
             min_inliers = min_inliers * MAX_RANSAC_MATCHES // len(matches)
-            matches = matches[kept]
+            matches = matches[np.sort(chosen)]
         min_share = np.clip(min_inliers / len(matches), 1e-3, 0.99)
         trials = np.log(1 - RANSAC_CONFIDENCE) / np.log1p(-(min_share**3))  # to draw one sample of three inliers
         options = {

@@ -53,6 +53,9 @@ CACHED_IMAGES = 256
 
 MatchCache = dict[tuple[int, int, int], tuple[Ints, Ints]]
 """(query image, kind of features, map image) -> query keypoints (K,) and the map points (K,) that they match."""
+Candidates = tuple[Matches, Ints]
+"""K candidate matches of a query image and one kind of features, highest score first, with the indices (K,) of their
+keypoints in the image. A keypoint or a point may be in several of them."""
 
 # Of the check of the intrinsics
 SIGNIFICANCE = 1e-4
@@ -193,7 +196,7 @@ class MappedFeatures:
 
     def candidates(
         self, query: RigQuery, kind: int, rig_from_world: Floats, references: Sequence[int], radius_deg: float
-    ) -> Iterator["Candidates"]:
+    ) -> Iterator[Candidates]:
         """Yield, for each query image, candidate matches of its keypoints with map points that project near them.
 
         Args:
@@ -254,7 +257,7 @@ class MappedFeatures:
             order = np.argsort(near_point * len(features) + keypoint - (bits << 32))
             near_point, keypoint = near_point[order], keypoint[order]
             pixels = features.keypoints[keypoint].astype(np.float64)
-            yield Candidates(Matches(np.full(len(good), camera), pixels, point[near_point]), keypoint)
+            yield Matches(np.full(len(good), camera), pixels, point[near_point]), keypoint
 
 
 def _similarities(
@@ -271,17 +274,6 @@ def _similarities(
         unit_b.take(rows_b[pairs], axis=0, out=b[some], mode="clip")
         np.einsum("kd,kd->k", a[some], b[some], out=scores[pairs])
     return scores
-
-
-class Candidates(NamedTuple):
-    """K candidate matches of a query image and one kind of features, highest score first.
-
-    A keypoint or a point may be in several of them.
-    """
-
-    matches: Matches
-    keypoint: Ints
-    """(K,) index of the keypoint in the query image."""
 
 
 def _is_first(numbers: Ints) -> NDArray[np.bool_]:
@@ -313,8 +305,8 @@ class Vicinity:
         """
         self._query, self._candidates, self._points, self._radius_deg = query, candidates, points, radius_deg
         # A point has several candidates, but is projected once.
-        unique = [np.unique(group.matches.point, return_index=True, return_inverse=True) for group in candidates]
-        self._once = [group.matches[first] for group, (_, first, _) in zip(candidates, unique, strict=True)]
+        unique = [np.unique(matches.point, return_index=True, return_inverse=True) for matches, _ in candidates]
+        self._once = [matches[first] for (matches, _), (_, first, _) in zip(candidates, unique, strict=True)]
         self._which = [which for _, _, which in unique]
         self._projected = self._project(rig_from_world)
 
@@ -334,10 +326,11 @@ class Vicinity:
             limit: largest number of matches per camera and kind; those with the highest scores stay.
         """
         chosen = []
-        for projected, which, group in zip(self._project(rig_from_world), self._which, self._candidates, strict=True):
-            near = np.flatnonzero(self._near(projected[which], group.matches.pixels, group.matches, radius_deg))
-            mutual = near[_is_first(group.keypoint[near]) & _is_first(group.matches.point[near])]
-            chosen.append(group.matches[mutual[:limit]])
+        of_groups = zip(self._project(rig_from_world), self._which, self._candidates, strict=True)
+        for projected, which, (matches, keypoint) in of_groups:
+            near = np.flatnonzero(self._near(projected[which], matches.pixels, matches, radius_deg))
+            mutual = near[_is_first(keypoint[near]) & _is_first(matches.point[near])]
+            chosen.append(matches[mutual[:limit]])
         return Matches.pooled(chosen)
 
     def _project(self, rig_from_world: Floats) -> list[Floats]:
@@ -389,22 +382,21 @@ class MapMatcher:
             matches.append(Matches(camera_index, query.pixels(camera_index, keypoint, kind), point))
         return Matches.pooled(matches)
 
-    def vicinity(self, query: RigQuery, rig_from_world: Floats, images: Ints, radius_deg: float) -> Vicinity:
-        """Return the candidate matches around a pose with the points of map images."""
+    def vicinity(self, query: RigQuery, rig_from_world: Floats, points: Ints, radius_deg: float) -> Vicinity:
+        """Return the candidate matches around a pose with the points of the map images that observe the most of some
+        points, at most `MAX_GUIDED_IMAGES`.
+        """
+        counts = self.map.images_seeing(np.unique(points))
+        images = np.flatnonzero(counts)
+        images = images[np.argsort(-counts[images], kind="stable")[:MAX_GUIDED_IMAGES]]
         candidates = [
-            Candidates(replace(matches, point=matches.point + int(self._first_point[kind])), keypoint)
+            (replace(matches, point=matches.point + int(self._first_point[kind])), keypoint)
             for kind, features in enumerate(self.mapped)
             for matches, keypoint in features.candidates(
                 query, kind, rig_from_world, self._of_kind(kind, images), radius_deg
             )
         ]
         return Vicinity(query, candidates, self.map.points, rig_from_world, radius_deg)
-
-    def covisible(self, points: Ints) -> Ints:
-        """Return the map images that observe the most of some points, most first, at most `MAX_GUIDED_IMAGES`."""
-        counts = self.map.images_seeing(points)
-        images = np.flatnonzero(counts)
-        return images[np.argsort(-counts[images], kind="stable")[:MAX_GUIDED_IMAGES]]
 
     def kind_names(self, points: Ints) -> NDArray[np.str_]:
         """Return the name of the kind of features of each point."""

@@ -498,8 +498,7 @@ class PnpLocalizer(Localizer):
 
     def _guided_around(self, query: RigQuery, rig_from_world: Floats, points: Ints, radius_deg: float) -> Matches:
         """Return the guided matches at a pose with the images that observe some of the given points."""
-        images = self.matcher.covisible(np.unique(points))
-        vicinity = self.matcher.vicinity(query, rig_from_world, images, radius_deg)
+        vicinity = self.matcher.vicinity(query, rig_from_world, points, radius_deg)
         return vicinity.guided(rig_from_world, radius_deg, MAX_GUIDED_MATCHES)
 
     def _independent(self, inliers: Matches) -> int:
@@ -522,8 +521,7 @@ class PnpLocalizer(Localizer):
         vicinity: Vicinity | None = None
         for radius in self._radii_deg:
             if vicinity is None or not vicinity.reaches(pose, radius):
-                images = self.matcher.covisible(np.unique(inliers.point))
-                vicinity = self.matcher.vicinity(query, pose, images, radius)
+                vicinity = self.matcher.vicinity(query, pose, inliers.point, radius)
             guided = vicinity.guided(pose, radius, MAX_GUIDED_MATCHES)
             if len(guided) < min_matches:
                 break
@@ -744,7 +742,6 @@ def _best_first(hypotheses: Sequence[_Hypothesis]) -> list[_Hypothesis]:
 
 
 def _differ(hypothesis: _Hypothesis, other: _Hypothesis | Rival) -> bool:
-    """Tell whether two hypotheses are clearly different poses."""
     return not agree(hypothesis.world_from_rig, other.world_from_rig, RIVAL_DISTANCE)
 
 

@@ -11,7 +11,7 @@ In each case the points of the depth map are transformed to the image's camera, 
 
 import logging
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from threading import Lock
 
 import numpy as np
@@ -90,13 +90,9 @@ def lifted(camera: pycolmap.Camera, pixels: Floats, depth_m: Floats) -> Floats:
         return np.asarray(rays / rays[:, 2:] * np.asarray(depth_m)[:, None], np.float64)
 
 
-@dataclass(frozen=True)
-class _DepthMap:
-    """A depth map that belongs to an image."""
-
-    path: str  # path relative to raw_data/
-    camera: pycolmap.Camera | None  # camera of the depth map; None: the image's camera, possibly resized
-    cam_from_depth: Floats  # (4, 4) pose of the depth sensor in the image's camera
+_DepthMap = tuple[str, pycolmap.Camera | None, Floats]
+"""A depth map of an image: its path relative to raw_data/; its camera, None for that of the image, possibly resized;
+and cam_from_depth (4, 4), the pose of its sensor in the image's camera."""
 
 
 class DepthMaps:
@@ -105,7 +101,7 @@ class DepthMaps:
     def __init__(self, session: Session) -> None:
         self._session = session
         self.of = lru_cache(_KEPT)(self._see)
-        self._tracks: dict[str, tuple[Ints, Floats]] = {}
+        self._track_of = cache(session.poses_of_sensor)
         self._lock = Lock()
         self._logged: set[str] = set()
 
@@ -120,7 +116,7 @@ class DepthMaps:
         points, spacing = [np.zeros((0, 3))], 0.0
         for source in sources:
             try:
-                points_of_map, spacing_px = self._points(source, camera)
+                points_of_map, spacing_px = self._points(camera, *source)
                 points, spacing = [*points, points_of_map], max(spacing, spacing_px)
             except CaptureError as error:
                 reasons.append(str(error))
@@ -169,8 +165,8 @@ class DepthMaps:
             nearest = self._nearest(depth_id, timestamp, 0)
             if nearest is not None:
                 own = depth_id == sensor or not session.has_sensor(depth_id)
-                return [_DepthMap(nearest[1], None if own else session.camera(depth_id), np.eye(4))], []
-        sources, reasons = [], []
+                return [(nearest[1], None if own else session.camera(depth_id), np.eye(4))], []
+        sources, reasons = list[_DepthMap](), []
         world_from_cam = session.world_from_cam([row])[0]
         for depth_id in in_rig:
             nearest = self._nearest(depth_id, timestamp, MAX_OFFSET_US)
@@ -182,7 +178,7 @@ class DepthMaps:
                 reasons.append(f"depth map {nearest[1]}: {missing} has no pose at that time or near it")
                 continue
             cam_from_depth = geometry.invert(world_from_cam) @ world_from_depth
-            sources.append(_DepthMap(nearest[1], session.camera(depth_id), cam_from_depth))
+            sources.append((nearest[1], session.camera(depth_id), cam_from_depth))
         return sources, reasons
 
     def _nearest(self, sensor: str, timestamp: int, tolerance_us: int) -> tuple[int, str] | None:
@@ -198,10 +194,7 @@ class DepthMaps:
 
     def _pose(self, sensor: str, timestamp: int) -> Floats | None:
         """Return world_from_sensor at a time, interpolated between two poses; None if they are too far apart."""
-        with self._lock:
-            if sensor not in self._tracks:
-                self._tracks[sensor] = self._session.poses_of_sensor(sensor)
-            times, poses = self._tracks[sensor]
+        times, poses = self._track_of(sensor)
         after = int(np.searchsorted(times, timestamp))
         if after < len(times) and times[after] == timestamp:
             return np.asarray(poses[after])
@@ -211,15 +204,17 @@ class DepthMaps:
         rotation = Slerp([0, 1], Rotation.from_matrix(poses[after - 1 : after + 1, :3, :3]))(share).as_matrix()
         return geometry.make_pose(rotation, (1 - share) * poses[after - 1, :3, 3] + share * poses[after, :3, 3])
 
-    def _points(self, source: _DepthMap, image_camera: pycolmap.Camera) -> tuple[Floats, float]:
+    def _points(
+        self, image_camera: pycolmap.Camera, file: str, own_camera: pycolmap.Camera | None, cam_from_depth: Floats
+    ) -> tuple[Floats, float]:
         """Return the points (P, 3) of a depth map in the image's camera, and their spacing in its pixels."""
-        path = self._session.path / RAW_DATA / source.path
+        path = self._session.path / RAW_DATA / file
         depth = read_depth(path)
         height, width = depth.shape
-        camera = source.camera or image_camera
-        resized = source.camera is None and abs(width - height * camera.width / camera.height) <= 1
+        camera = own_camera or image_camera
+        resized = own_camera is None and abs(width - height * camera.width / camera.height) <= 1
         if not resized and (width, height) != (camera.width, camera.height):
-            expected = f"{camera.width} x {camera.height}" + (", or that aspect ratio" if source.camera is None else "")
+            expected = f"{camera.width} x {camera.height}" + (", or that aspect ratio" if own_camera is None else "")
             raise CaptureError(f"Depth map {path}: found {width} x {height} pixels, expected {expected}.")
         step = int(np.ceil(np.sqrt(max(np.count_nonzero(depth) / _MAX_POINTS, 1.0))))
         y, x = np.nonzero(depth[step // 2 :: step, step // 2 :: step])
@@ -228,7 +223,7 @@ class DepthMaps:
         points = lifted(camera, (np.column_stack([x, y]) + 0.5) * size, depth[y, x].astype(np.float64))
         points = points[np.isfinite(points).all(axis=1)]
         spacing_px = step * size.max() * image_camera.mean_focal_length() / camera.mean_focal_length()
-        return geometry.transform(source.cam_from_depth, points), float(spacing_px)
+        return geometry.transform(cam_from_depth, points), float(spacing_px)
 
 
 def _visible(points: Floats, camera: pycolmap.Camera, cell_px: float, reason: str) -> SeenDepth:

@@ -87,10 +87,9 @@ def select_references(
     if not len(usable) or k < 1:
         return np.zeros(0, np.int64)
     score, poses = score[usable], poses[usable]
-    spread = score.max() - score.min()
-    similarity = MIN_SIMILARITY + (1 - MIN_SIMILARITY) * (score - score.min()) / (spread if spread > 0 else 1.0)
-    if spread == 0:
-        similarity[:] = 1.0
+    spread, similarity = score.max() - score.min(), np.ones(len(score))
+    if spread > 0:
+        similarity = MIN_SIMILARITY + (1 - MIN_SIMILARITY) * (score - score.min()) / spread
     shared = _shared_view(poses, [cameras[int(index)] for index in usable], depth_m)
     if shared_points is not None:
         counts = np.asarray(shared_points, np.float64)[np.ix_(usable, usable)]
@@ -217,7 +216,13 @@ class FeedForwardLocalizer(Localizer):
         raised and does not affect the others; one of all queries is, such as of the device, weights or memory, see
         `errors.reason_of`.
         """
-        chosen, groups = self._groups(queries)
+        chosen = [[self._choose(retrieved) for retrieved in references] for _, references in queries]
+        groups = {
+            (number, camera): [self._as_shown(query.views[camera]), *(self.view(int(index)) for index in references)]
+            for number, (query, _) in enumerate(queries)
+            for camera, references in enumerate(chosen[number])
+            if len(references)
+        }
         results = self._predict(list(groups.values()))
         predictions = dict(zip(groups, results, strict=True))
         return [
@@ -227,16 +232,6 @@ class FeedForwardLocalizer(Localizer):
             )
             for number, references in enumerate(chosen)
         ]
-
-    def _groups(self, queries: Sequence[QueryInput]) -> tuple[list[list[Ints]], dict[tuple[int, int], list[View]]]:
-        chosen = [[self._choose(retrieved) for retrieved in references] for _, references in queries]
-        groups = {
-            (number, camera): [self._as_shown(query.views[camera]), *(self.view(int(index)) for index in references)]
-            for number, (query, _) in enumerate(queries)
-            for camera, references in enumerate(chosen[number])
-            if len(references)
-        }
-        return chosen, groups
 
     def _as_shown(self, view: View) -> View:
         return view if self._upright else replace(view, turns=0)
@@ -248,7 +243,6 @@ class FeedForwardLocalizer(Localizer):
         return View(name, self._session.image_path(row), self.map.cameras[index], True, int(self._turns[row]))
 
     def _choose(self, references: References) -> Ints:
-        """Choose the references of one query image."""
         in_map = references.images < len(self.map.image_names)  # larger indices are images of other kinds of features
         candidates = references.images[in_map]
         if not len(candidates):

@@ -13,7 +13,6 @@ from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from functools import cache, cached_property, partial
 from pathlib import Path
-from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -100,7 +99,7 @@ class SimulatedPredictor:
         self._sessions = {session.id: session for session in sessions}
         self._map_dir = None if map_dir is None else Path(map_dir)
         self._features = features
-        self._noise = {
+        self.settings: dict[str, Any] = {
             "rotation_noise_deg": rotation_noise_deg,
             "position_noise_m": position_noise_m,
             "depth_noise": depth_noise,
@@ -109,12 +108,6 @@ class SimulatedPredictor:
         }
         self._map = cache(self._load_map)
         self._depths: OrderedDict[str, Floats] = OrderedDict()
-        self._lock = Lock()
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The noise and the seed."""
-        return dict(self._noise)
 
     @cached_property
     def _truth(self) -> dict[str, Floats]:
@@ -129,7 +122,7 @@ class SimulatedPredictor:
         return [self._predict(list(group)) for group in groups]
 
     def _random(self, *key: Any) -> np.random.Generator:
-        text = json.dumps([self._noise["seed"], *key])
+        text = json.dumps([self.settings["seed"], *key])
         return np.random.default_rng(int.from_bytes(hashlib.sha256(text.encode()).digest()[:16]))
 
     def _predict(self, group: list[View]) -> Prediction:
@@ -153,27 +146,25 @@ class SimulatedPredictor:
 
     def _noisy(self, world_from_cam: Floats, names: list[str], view: View, group: Floats) -> Floats:
         rng = self._random(names, view.name)
-        turn = Rotation.from_rotvec(rng.normal(size=3) * np.radians(self._noise["rotation_noise_deg"]) / np.sqrt(3))
-        moved = rng.normal(size=3) * self._noise["position_noise_m"] / np.sqrt(3)
-        if view.in_map and rng.random() < self._noise["wrong_references"]:
+        turn = Rotation.from_rotvec(rng.normal(size=3) * np.radians(self.settings["rotation_noise_deg"]) / np.sqrt(3))
+        moved = rng.normal(size=3) * self.settings["position_noise_m"] / np.sqrt(3)
+        if view.in_map and rng.random() < self.settings["wrong_references"]:
             turn = Rotation.random(random_state=rng)
             moved = rng.normal(size=3) * max(2.0, float(np.ptp(group[:, :3, 3], axis=0).max()))
         return geometry.make_pose(world_from_cam[:3, :3] @ turn.as_matrix(), world_from_cam[:3, 3] + moved)
 
     def _depth(self, view: View, group: list[View], names: list[str], grid: Ints) -> Floats:
         key = f"{view.name} {grid}"
-        with self._lock:
-            depth = self._depths.get(key) if view.in_map else None
+        depth = self._depths.get(key) if view.in_map else None
         if depth is None:
             points = self._points(view) if view.in_map else np.concatenate([self._points(v) for v in group])
             depth = _nearest_depth(points, view, self._truth[view.name], grid)
-            with self._lock:
-                if view.in_map:  # the depth of a query depends on its group
-                    self._depths[key] = depth
+            if view.in_map:  # the depth of a query depends on its group
+                self._depths[key] = depth
                 if len(self._depths) > _KEPT:
                     self._depths.popitem(last=False)
         noise = self._random(names, view.name, "depth").normal(size=depth.shape)
-        return depth * (1 + self._noise["depth_noise"] * noise)
+        return depth * (1 + self.settings["depth_noise"] * noise)
 
     def _points(self, view: View) -> Floats:
         """Return world points (P, 3) that a map image observes, else of its depth maps; none for a query image."""
@@ -360,7 +351,6 @@ class NetworkPredictor:
 
         Other threads decode the next images in the meantime, except those whose encoding is cached.
         """
-
         views = {placed.key: placed for batch in batches for group in batch for placed in group}
         unread = {key: placed for key, placed in views.items() if key not in self._cache}
         decoded = prefetch(self._read, list(unread.values()), workers=default_workers(), ahead=_IMAGES_AT_A_TIME)
@@ -454,7 +444,6 @@ class NetworkPredictor:
             return run(tokens)
 
     def _heads(self, size: Size, tokens: "Tensor") -> "Tensor":
-        """Return the network's outputs (B, S, 9 + 2 H W) on the CPU for tokens (B, S, P, C) of images (H, W)."""
         import torch
 
         images = torch.empty(*tokens.shape[:2], 3, *size, device="meta")

@@ -6,7 +6,6 @@ import json
 import math
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -84,18 +83,6 @@ EVALUATION_FIGURES = {
         "image near the true camera; no pose: too few matches agreed; wrong pose: beyond the threshold.",
     ),
 }
-
-
-@dataclass
-class Picture:
-    data: str
-    """data: URL; empty if the page has no room left."""
-    title: str
-    caption: str
-    path: str
-    """Relative to the run folder."""
-    width: int = 0
-    """Width that it is shown with, pixels, so that letters are as large in all pictures."""
 
 
 def write_report(run_dir: str | Path) -> Path:
@@ -204,7 +191,6 @@ def _stages(run: dict[str, Any], run_dir: Path) -> Markup:
 
 
 def _not_done(run: dict[str, Any]) -> Markup:
-    """List the items that stages left out, and why."""
     items = [(row, item) for row in run["stages"] for item in row.get("left_out") or ()]
     columns = ["scene", "what", "reason", "stages"]
     rows = [(row.get("scene"), item.get("what"), item.get("reason"), row.get("stage")) for row, item in items]
@@ -448,7 +434,6 @@ def _steps(sequences: pd.DataFrame, thresholds: list[str]) -> Markup:
 
 
 def _changes(changes: pd.DataFrame, unit: str) -> Markup:
-    """List queries that the sequence stage broke or rescued."""
     if not len(changes):
         return Markup()
     shown = changes.sort_values("change", kind="stable")[:WORST]
@@ -480,7 +465,6 @@ def _losses(losses: pd.DataFrame) -> Markup:
 
 
 def _failures(queries: pd.DataFrame) -> Markup:
-    """Count the queries without a pose by reason."""
     failed = queries[statuses(queries["status"]) == Status.FAILED] if len(queries) else queries
     if not len(failed):
         return Markup()
@@ -496,7 +480,6 @@ def _failures(queries: pd.DataFrame) -> Markup:
 
 
 def _wrong_ok(errors: pd.DataFrame, unit: str) -> Markup:
-    """List the poses that are called ok but are wrong, the largest errors first."""
     if not len(errors):
         return Markup()
     called_ok = errors[statuses(errors["status"]) == Status.OK]
@@ -633,11 +616,14 @@ class Album:
     def __init__(self, run_dir: Path, room: int, left_out: list[str]) -> None:
         self.run_dir, self.room, self.left_out = run_dir, room, left_out
 
-    def picture(self, path: Path, title: str = "", caption: str = "") -> Picture:
-        """Return a picture for the page; without a `title`, it has the one in the file."""
+    def picture(self, path: Path, title: str = "", caption: str = "") -> dict[str, Any]:
+        """Return a picture for the page, without data if there is no room left; its default title is in the file.
+
+        It is as wide, in pixels, as makes letters equally large in all pictures.
+        """
         from PIL import Image
 
-        name, link = str(path.relative_to(self.run_dir)), _link(self.run_dir, path)
+        name, shown = str(path.relative_to(self.run_dir)), {"data": "", "path": _link(self.run_dir, path)}
         try:
             with Image.open(path) as image:
                 info = getattr(image, "text", {})
@@ -649,9 +635,10 @@ class Album:
                     if len(small) < len(data):  # plots are often smaller as PNG
                         data, kind = small, "jpeg"
         except (OSError, ValueError, SyntaxError) as error:  # Pillow raises the latter two for some torn PNGs
-            return Picture("", f"{name} cannot be read: {error}", "", link)
+            return shown | {"title": f"{name} cannot be read: {error}", "caption": ""}
         if len(data) > self.room:
             self.left_out.append(name)
-            return Picture("", title, caption, link)
+            return shown | {"title": title, "caption": caption}
         self.room -= len(data)
-        return Picture(f"data:image/{kind};base64,{base64.b64encode(data).decode()}", title, caption, link, width)
+        url = f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+        return shown | {"title": title, "caption": caption, "data": url, "width": width}

@@ -11,9 +11,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from toolkit.capture import Capture, Session
-from toolkit.geometry import Floats, Ints
+from toolkit.geometry import Floats, Ints, invert
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.base import QueryResult, Status, View
+from toolkit.pose.base import QueryResult, Status, View, carried_over
 from toolkit.results.metrics import is_posed
 from toolkit.results.pair import PairResults
 
@@ -110,17 +110,13 @@ class QueryDetails:
 
     @property
     def position_covariance(self) -> Floats | None:
-        """Covariance (3, 3) of the first image's position in the world, square meters; None if it is unknown.
-
-        A small motion of the rig in its own frame, rotation w and translation t, moves a camera at c by t + w x c.
-        """
+        """Covariance (3, 3) of the first image's position in the world, square meters; None if it is unknown."""
         pose, covariance = self.result.world_from_rig, self.result.covariance
         if pose is None or covariance is None:
             return None
-        x, y, z = self.rig_from_cam[:3, 3]
-        lever = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
-        moves = pose[:3, :3] @ np.hstack([lever, np.eye(3)])
-        return np.asarray(moves @ covariance @ moves.T)
+        of_cam = carried_over(covariance, invert(self.rig_from_cam))[3:, 3:]
+        R = pose[:3, :3] @ self.rig_from_cam[:3, :3]
+        return R @ of_cam @ R.T
 
     def captioned_references(self) -> list[tuple[ShownImage, str, bool]]:
         """Return at most `REFERENCES` references, up to two of them rejected: image, caption, whether used."""

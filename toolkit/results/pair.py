@@ -35,7 +35,6 @@ from toolkit.files import (
     pair_devices,
     pair_name,
     read_map_record,
-    require_current,
     require_whole,
     write_atomic,
 )  # fmt: skip
@@ -206,10 +205,6 @@ class PairResults:
         table = table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation)
         lengths = table.columns.intersection(["translation_error_m", "position_std_m"])
         return named_by_unit(table.assign(**table[lengths] / self.unit[1]), self.unit[0])
-
-    def require_current(self) -> None:
-        """Raise ArtifactError if the poses were made from other files than those that are there now."""
-        require_current(self.path, "localize", missing=False)
 
 
 def _open(h5: Path) -> h5py.File:

@@ -20,7 +20,7 @@ from toolkit.capture.session import RECONSTRUCTION_RECORD
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_folders, open_descriptors, shows_upright
 from toolkit.embedders.masks import near as within
-from toolkit.embedders.search import VectorIndex, embedder_fingerprint, fuse, load_index, search
+from toolkit.embedders.search import VectorIndex, embedder_fingerprint, fused_products, load_index, search
 from toolkit.errors import ArtifactError
 from toolkit.features.features import KINDS, SiftExtractor, usable
 from toolkit.features.matching import (
@@ -650,8 +650,9 @@ class Map:
     @property
     def refined_poses(self) -> dict[str, Floats]:
         """Pose (4, 4) of each map image by its name, if the map was built with refined poses; else empty."""
-        refined = self._first and self.settings.map is not None and self.settings.map.refine_poses
-        return self._first.poses if self._first and refined else {}
+        if not self._first or self.settings.map is None or not self.settings.map.refine_poses:
+            return {}
+        return dict(zip(self._first.image_names, self._first.world_from_cams, strict=True))
 
     @cached_property
     def cameras(self) -> MapCameras:
@@ -824,10 +825,8 @@ class ReferenceSearch:
             found = search(vector[None], of_map, k, "torch", "cpu", index=self._index, allowed=allowed, dims=dims)
             scores, nearest = (of_vector[0, found[1][0] >= 0] for of_vector in found)
             return rows[nearest], scores.astype(np.float64)
-        ends = np.cumsum(dims)[:-1]
-        parts = zip(np.split(of_map, ends, axis=1), np.split(vector.astype(np.float64), ends), strict=True)
-        products = [np.einsum("nd,d->n", descriptors, described) for descriptors, described in parts]
-        scores = (products[0] if len(products) == 1 else fuse(products)).astype(np.float32)
+        products = fused_products(vector.astype(np.float64), of_map, dims, lambda a, b: np.einsum("nd,d->n", b, a))
+        scores = products.astype(np.float32)
         if not np.isfinite(scores).all():
             raise ValueError("The descriptors of the query or of the map have NaN or infinite values.")
         candidates = np.arange(len(rows)) if allowed is None else np.flatnonzero(allowed)

@@ -199,7 +199,7 @@ class InspectedPair:
     @cached_property
     def _map(self) -> Map:
         """Cached: opening the map takes time."""
-        self.localized.results.require_current()
+        require_current(self.localized.results.path, "localize", missing=False)
         scene_map = Map.of_pair(self._h5, self.map_device, self._features_dir, self._map_dir)
         if not self._files.embeddings.is_dir():
             return scene_map

@@ -62,7 +62,6 @@ if TYPE_CHECKING:
 
 Image = NDArray[np.uint8]
 APPLICATION = "visual-localization"
-POINT_COLOR = GRAY
 IMAGE_SIZE, JPEG_QUALITY = 480, 75
 """Longer side of the images shown, pixels, and their JPEG quality, 1 to 100."""
 HIDDEN_M = 1e-3
@@ -184,7 +183,7 @@ def camera_depth_m(centers: Floats) -> float:
 
 def log_points(stream: rr.RecordingStream, points: ArrayLike, colors: NDArray[np.uint8] | None) -> None:
     """Log the map's points (P, 3), colors (P, 3) RGB or None, as `world/points`."""
-    cloud = rr.Points3D(points, colors=rgb(POINT_COLOR) if colors is None else colors, radii=rr.Radius.ui_points(1.5))
+    cloud = rr.Points3D(points, colors=rgb(GRAY) if colors is None else colors, radii=rr.Radius.ui_points(1.5))
     stream.log("world/points", cloud, static=True)
 
 
@@ -295,13 +294,9 @@ class View3D:
         """Write a recording for the rerun viewer, `.rrd`, and return its path."""
         cameras = [answer.details.cameras[0] for answer in self.answers]
         errors = [answer.error or (np.nan, np.nan) for answer in self.answers]
-        table = pd.DataFrame({
-            "status": [answer.result.status_text for answer in self.answers],
-            "method": [answer.result.found_by for answer in self.answers],
-            "num_inliers": [answer.result.num_inliers for answer in self.answers],
-            "rotation_error_deg": [error[0] for error in errors],
-            "translation_error_m": [error[1] for error in errors],
-        })  # fmt: skip
+        rotation_deg, translation = np.reshape(errors, (-1, 2)).T
+        table = pd.DataFrame([answer.result.to_row(0, "") for answer in self.answers])
+        table = table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation)
         estimated = np.array([camera.world_from_cam for camera in cameras]).reshape(-1, 4, 4)
         true = np.array([camera.world_from_cam_true for camera in cameras]).reshape(-1, 4, 4)
         names = [shown_name(answer.name) for answer in self.answers]
@@ -450,7 +445,7 @@ class _ChosenWriter:
         self._stream, self._queries, self._depth_m, self._shift = stream, queries, camera_depth_m, shift
         self._sizes: dict[str, tuple[int, int]] = {}
         """Width and height of the images last logged, by entity."""
-        self._jpeg_of = lru_cache(KEPT_JPEGS)(_jpeg_of)
+        self._jpeg_of = lru_cache(KEPT_JPEGS)(lambda path: small_jpeg(read_for_display(path, IMAGE_SIZE), IMAGE_SIZE))
 
     def _jpeg(self, image: ShownImage) -> tuple[bytes, tuple[int, int]]:
         pixels = image.image
@@ -465,8 +460,6 @@ class _ChosenWriter:
 
     def write(self, number: int, query: QueryDetails) -> None:
         """Log a query. Entities that it lacks are cleared, or those of the last query would stay."""
-        import rerun as rr
-
         stream, references, center = self._stream, query.captioned_references(), self._queries.estimated[number, :3, 3]
         stream.set_time(QUERY, sequence=number)
         for k, image in zip_longest(range(MAX_CAMERAS), query.cameras[:MAX_CAMERAS]):
@@ -474,14 +467,12 @@ class _ChosenWriter:
         for rank, reference in zip_longest(range(1, REFERENCES + 1), references):
             image, _, agrees = reference or (None, "", True)
             self._log_image(f"world/references/{rank}", image, SKY if agrees else ORANGE, residuals=False)
-        if query.cameras:
-            camera, true = query.cameras[0].camera, query.cameras[0].world_from_cam_true
-            has_truth = bool(is_posed(true))
-            if has_truth:
-                stream.log("world/truth/camera_0", transform_of(shifted(true, self._shift)))
-            depth_m = self._depth_m if has_truth else HIDDEN_M
-            pinhole = pinhole_of(camera, (camera.width, camera.height), depth_m, TRUE)
-            stream.log("world/truth/camera_0", pinhole)
+        camera, true = query.cameras[0].camera, query.cameras[0].world_from_cam_true
+        has_truth = bool(is_posed(true))
+        if has_truth:
+            stream.log("world/truth/camera_0", transform_of(shifted(true, self._shift)))
+        depth_m = self._depth_m if has_truth else HIDDEN_M
+        stream.log("world/truth/camera_0", pinhole_of(camera, (camera.width, camera.height), depth_m, TRUE))
         points = np.concatenate([np.zeros((0, 3)), *(image.points[image.agrees] for image in query.cameras)])
         dots = rr.Points3D(points + self._shift, colors=rgb(GREEN), radii=rr.Radius.ui_points(3))
         stream.log("world/chosen_points", dots)
@@ -503,31 +494,26 @@ class _ChosenWriter:
 
     def _log_doubt(self, query: QueryDetails, seen: Floats, center: Floats) -> None:
         """Log the 95 % region of the position, the rival poses, and rays from the center (3,) to points (n, 3)."""
-        values, vectors = np.zeros(0), np.eye(3)
-        if query.position_covariance is not None:
-            values, vectors = np.linalg.eigh(query.position_covariance)
-            vectors = vectors * np.sign(np.linalg.det(vectors))
-        w, x, y, z = rotation_to_quaternion(vectors)
+        covariance = query.position_covariance
+        values, vectors = np.linalg.eigh(np.zeros((0, 3, 3)) if covariance is None else covariance[None])
+        vectors = vectors * np.sign(np.linalg.det(vectors))[:, None, None]
         region = rr.Ellipsoids3D(
-            half_sizes=[SURE_3D * np.sqrt(np.maximum(values, 0))] if len(values) else [],
-            centers=[center + self._shift] if len(values) else [],
-            quaternions=[rr.Quaternion(xyzw=[x, y, z, w])] if len(values) else [],
+            half_sizes=SURE_3D * np.sqrt(np.maximum(values, 0)),
+            centers=[center + self._shift] * len(values),
+            quaternions=[rr.Quaternion(xyzw=np.roll(wxyz, -1)) for wxyz in rotation_to_quaternion(vectors)],
             colors=rgb(ESTIMATED),
             fill_mode="majorwireframe",
         )
         self._stream.log("world/uncertainty", region)
-        poses = np.array([pose for pose, _ in query.rivals]).reshape(-1, 4, 4)
+        poses = shifted(np.array([pose for pose, _ in query.rivals]).reshape(-1, 4, 4), self._shift)
         labels = [f"rival, {support:.0%} of the support" for _, support in query.rivals]
-        color = rgb(TRUE)
-        lines = pyramids(shifted(poses, self._shift) if len(poses) else poses, self._depth_m / 2).astype(np.float32)
-        self._stream.log("world/rivals", rr.LineStrips3D(lines, labels=labels, colors=color, show_labels=False))
+        lines = pyramids(poses, self._depth_m / 2).astype(np.float32)
+        self._stream.log("world/rivals", rr.LineStrips3D(lines, labels=labels, colors=rgb(TRUE), show_labels=False))
         rays = [np.stack([center, point]) + self._shift for point in seen]
         self._stream.log("world/rays", rr.LineStrips3D(rays, colors=rgb(GREEN), radii=rr.Radius.ui_points(0.5)))
 
     def _log_image(self, path: str, image: ShownImage | None, color: str, residuals: bool) -> None:
         """Log an image (None: a gray one) with its camera, keypoints and, for `residuals`, projected points."""
-        import rerun as rr
-
         stream, measured, agrees = self._stream, np.zeros((0, 2)), np.zeros(0, bool)
         predicted, lines = np.zeros((0, 2)), np.zeros((0, 2, 2))
         if image is None:
@@ -557,10 +543,6 @@ class _ChosenWriter:
             dots = rr.Points2D(marks, colors=shade, radii=rr.Radius.ui_points(radius))
             stream.log(f"{path}/marks/{name}", dots)
         stream.log(f"{path}/marks/residuals", rr.LineStrips2D(lines.astype(np.float32), colors=WHITE))
-
-
-def _jpeg_of(path: Path) -> tuple[bytes, tuple[int, int]]:
-    return small_jpeg(read_for_display(path, IMAGE_SIZE), IMAGE_SIZE)
 
 
 def describe(queries: Localizations, k: int) -> str:

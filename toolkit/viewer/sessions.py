@@ -16,8 +16,9 @@ from numpy.typing import ArrayLike
 from tqdm.auto import tqdm
 
 from toolkit.capture import DEPTH_SCALE, Capture, Session, Trajectory
-from toolkit.capture.images import decode, default_workers, prefetch, read_for_display, read_image
+from toolkit.capture.images import default_workers, prefetch, read_for_display, read_image
 from toolkit.capture.names import color_of
+from toolkit.capture.tables import read_depth
 from toolkit.capture.upright import up_of_cameras
 from toolkit.errors import ArtifactError, CaptureError, ImageError
 from toolkit.figures.style import ORANGE
@@ -155,7 +156,7 @@ def record_session(
         if localized is not None:
             _log_queries(stream, localized, session, origin)
             counts["queries"] = len(localized.poses)
-        reader = _Reader.of(session, image_size)
+        reader = _Reader(session, image_size)
         writer = _FrameWriter(stream, viewer.camera_depth_m(placed[:, :3, 3]), color_of(session.device))
         writer.announce(frames)
         loaded = prefetch(reader.read, frames, default_workers())
@@ -311,23 +312,16 @@ class _Shot:
     is_depth: bool = False
 
 
-@dataclass(frozen=True)
 class _Reader:
     """Reads the images and depth maps of frames; thread-safe."""
 
-    session: Session
-    image_size: int
-    depths: dict[tuple[int, str], Ints]
-    """Rows of the session's depth maps by timestamp and device."""
-    rig_from_depth: Floats
-
-    @classmethod
-    def of(cls, session: Session, image_size: int) -> "_Reader":
-        if session.depths is None:
-            return cls(session, image_size, {}, np.zeros((0, 4, 4)))
-        times = session.depths["timestamp"].to_numpy(np.int64)
-        devices, rig_from_depth = session.devices_of(times, session.depths["sensor_id"])
-        return cls(session, image_size, pd.DataFrame([times, devices]).T.groupby([0, 1]).indices, rig_from_depth)
+    def __init__(self, session: Session, image_size: int) -> None:
+        self.session, self.image_size, self.depths = session, image_size, dict[tuple[int, str], Ints]()
+        """Rows of the session's depth maps by timestamp and device."""
+        if session.depths is not None:
+            times = session.depths["timestamp"].to_numpy(np.int64)
+            devices, self.rig_from_depth = session.devices_of(times, session.depths["sensor_id"])
+            self.depths = pd.DataFrame([times, devices]).T.groupby([0, 1]).indices
 
     def read(self, frame: _Frame) -> list[_Shot]:
         """Return the images and depth maps of a frame."""
@@ -354,16 +348,14 @@ class _Reader:
 
     def _depth(self, path: Path) -> tuple[bytes, tuple[int, int], bool]:
         try:
-            depth = decode(path, cv2.IMREAD_UNCHANGED)
-        except ImageError:
-            return b"", (0, 0), False
-        if depth.dtype != np.uint16 or depth.ndim != 2:
+            depth = read_depth(path)
+        except CaptureError:
             return b"", (0, 0), False
         scale = min(1.0, self.image_size / 2 / max(depth.shape))
         width, height = (max(1, round(scale * side)) for side in depth.shape[::-1])
         # Nearest: averages across depth edges would float in the air.
         small = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST)
-        return cv2.imencode(".png", small)[1].tobytes(), (width, height), True
+        return cv2.imencode(".png", np.rint(small * DEPTH_SCALE).astype(np.uint16))[1].tobytes(), (width, height), True
 
 
 class _FrameWriter:
@@ -379,8 +371,6 @@ class _FrameWriter:
 
     def write(self, frame: _Frame, shots: list[_Shot]) -> Counter[str]:
         """Log a frame; return the counts of its images and depth maps by kind."""
-        import rerun as rr
-
         if self._frame is not None and self._frame.subsession != frame.subsession:
             self.end_subsession()
         self._frame = frame
