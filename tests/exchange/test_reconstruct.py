@@ -44,9 +44,7 @@ def photographs(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -
 
 @pytest.fixture(scope="session")
 def place(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    place = tmp_path_factory.mktemp("place") / "PLACE"
-    reconstruct([photographs], place, hold_out=4)
-    return place
+    return Capture.reconstruct([photographs], tmp_path_factory.mktemp("place") / "PLACE", hold_out=4).path
 
 
 def estimated_cameras(session: Session) -> set[str]:

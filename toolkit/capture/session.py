@@ -18,6 +18,7 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property, lru_cache
 from html import escape
+from importlib import import_module
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -620,6 +621,13 @@ class Capture:
         if root.name != "sessions":
             raise CaptureError(f"{root} is not the `sessions` folder of a capture; expected <capture>/sessions.")
         return cls(root.parent)
+
+    @classmethod
+    def reconstruct(cls, sources: Sequence[str | Path], capture: str | Path, **options: Any) -> "Capture":
+        """Make a map from photographs or videos without poses, and open it; see `exchange.reconstruct.reconstruct`."""
+        # That module stands on captures, so it is imported by its name.
+        made: Capture = import_module("toolkit.exchange.reconstruct").reconstruct(sources, capture, **options).capture
+        return made
 
     @property
     def name(self) -> str:
