@@ -65,9 +65,7 @@ class Odometry:
 
     def scaled(self, factor: float) -> "Odometry":
         """Return the odometry with all translations multiplied by a factor."""
-        poses = self.odom_from_rig.copy()
-        poses[:, :3, 3] *= factor
-        return replace(self, odom_from_rig=poses)
+        return replace(self, odom_from_rig=geometry.scaled(self.odom_from_rig, factor))
 
     def drift(self, settings: SequenceSettings, first: Ints, second: Ints) -> tuple[Floats, Floats]:
         """Return standard deviations (n,) by axis of the relative poses of n pairs of frames: radians, meters."""
