@@ -355,11 +355,6 @@ class GuessedCamera(NamedTuple):
     """The image is a part of the one that EXIF describes, so its principal point may be anywhere."""
 
 
-def exif_camera(path: Path) -> GuessedCamera:
-    """Return `camera_from_exif` of the header of an image, which is read; raise ImageError also if it cannot be."""
-    return camera_from_exif(*read_header(path))
-
-
 def camera_from_exif(size: tuple[int, int], exif: Mapping[int, Any]) -> GuessedCamera:
     """Guess the intrinsics of an image from its header: no distortion, principal point in the image center.
 
