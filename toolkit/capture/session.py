@@ -190,7 +190,10 @@ class Session:
 
     @cached_property
     def _roots(self) -> list[Path]:
-        return names.roots_of(self.path)
+        """The resolved folders in which files may lie: that of the session and its capture's."""
+        path = self.path.absolute()
+        in_capture = path.parent.name == "sessions"
+        return [root.resolve() for root in (path, *(path.parents[:2] if in_capture else ()))]
 
     # Files
 

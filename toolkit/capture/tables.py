@@ -239,8 +239,7 @@ def convert(column: pa.Array, kind: str) -> tuple[pa.Array, NDArray[np.bool_]]:
                 wrong[row] = True
         converted = pc.if_else(pa.array(wrong), "0", column).cast(target)
     if kind == INTEGER:  # Arrow reads 0x10 as 16
-        wrong |= pc.match_substring(column, "x").to_numpy(zero_copy_only=False)
-        wrong |= pc.match_substring(column, "X").to_numpy(zero_copy_only=False)
+        wrong |= pc.match_substring(column, "x", ignore_case=True).to_numpy(zero_copy_only=False)
     elif most is not None:
         values = np.abs(converted.to_numpy())
         wrong |= ~((values <= most) & (values < np.inf))
