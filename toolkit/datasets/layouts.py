@@ -298,8 +298,7 @@ def _kitti(folder: Path) -> tuple[Path, list[ListedImage]]:
     images = []
     for file in files:
         row = int(file.stem)
-        known = row < min(len(poses), len(times))
-        known = known and bool(np.isfinite(poses[row]).all())
+        known = row < min(len(poses), len(times)) and bool(np.isfinite(poses[row]).all())
         pose = poses[row] @ invert(cam_from_gray) if known else f"not in {truth}"
         name, time_us = file.relative_to(folder).as_posix(), round(times[row] * 1e6) if known else None
         images.append(ListedImage(name, "", camera, pose, time_us))

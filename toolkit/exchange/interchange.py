@@ -599,7 +599,6 @@ def _read_transforms(path: Path) -> dict[str, Any]:
     if not isinstance(frames, list) or not any(isinstance(frame, dict) for frame in frames):
         found = f"keys {', '.join(map(repr, content))[:100]}" if isinstance(content, dict) else repr(content)[:100]
         raise CaptureError(f"{path}: frames: found {found or 'nothing'}, no list of frames. {expected}")
-    assert isinstance(content, dict)
     return content
 
 
