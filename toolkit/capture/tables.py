@@ -169,7 +169,6 @@ def _layout(columns: Columns) -> str:
 
 
 def _parse(path: Path, data: bytes, columns: Columns, keep_extra: bool) -> TextTable:
-    """Split and convert the lines of a file."""
     texts = data.removeprefix(b"\xef\xbb\xbf").split(b"\n")  # without the byte-order mark of Windows editors
     problems: list[tuple[int, str]] = []
     if _fault(data.replace(b"\r\n", b"\n")):

@@ -256,7 +256,6 @@ def _eth3d(folder: Path) -> tuple[Path, list[ListedImage]]:
 
 
 def _of_model(model: ColmapModel, split: str) -> list[ListedImage]:
-    """Return the images of a COLMAP model."""
     images = []
     for image in model.images.values():
         camera, pose = model.cameras.get(image.camera_id, "its camera is not in the model"), image.cam_from_world
