@@ -19,6 +19,7 @@ from typing import Any, BinaryIO, NamedTuple, TypeVar
 import cv2
 import numpy as np
 import PIL.Image
+import psutil
 import pycolmap
 from numpy.typing import ArrayLike, NDArray
 from PIL import JpegImagePlugin, PngImagePlugin
@@ -177,20 +178,14 @@ def read_image(
     return image if longest is None else shrunk(image, longest)
 
 
-def pixels_of(
-    image: str | Path | NDArray[np.uint8], gray: bool = False, min_side: int | None = None
-) -> NDArray[np.uint8]:
+def pixels_of(image: Path | NDArray[np.uint8], gray: bool, min_side: int | None) -> NDArray[np.uint8]:
     """Return an image in gray, (H, W), or in color, (H, W, 3) RGB.
 
-    Raise ImageError if the file is missing or cannot be decoded, or the pixels have another shape or type.
-
     Args:
-        image: a file, see `read_image`; or pixels (H, W) or (H, W, 3) RGB uint8.
+        image: a file, see `read_image` also for the errors; or pixels (H, W) or (H, W, 3) RGB.
     """
-    if isinstance(image, str | Path):
+    if isinstance(image, Path):
         return read_image(image, gray, min_side)
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
-        raise ImageError(f"Found pixels {image.shape} {image.dtype}: expected (H, W) or (H, W, 3) uint8.")
     if gray == (image.ndim == 2):
         return image
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY if gray else cv2.COLOR_GRAY2RGB), np.uint8)
@@ -230,8 +225,6 @@ def default_workers() -> int:
     It is limited by the CPU affinity of the process, the CPU quota of its container, and the memory of the machine and
     the container, with `THREAD_BYTES` per thread.
     """
-    import psutil
-
     if (workers := os.environ.get(WORKERS, "")).isdecimal():
         return max(1, int(workers))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -20,16 +20,17 @@ from functools import cached_property, lru_cache
 from html import escape
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
+import pycolmap
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture import names
-from toolkit.capture.images import camera_text, parse_camera
+from toolkit.capture.images import camera_text, parse_camera, thumbnails
 from toolkit.capture.names import SPLITS, in_order, require_name, session_id, session_of
 from toolkit.capture.tables import (
     ALIGNED,
@@ -49,9 +50,6 @@ from toolkit.capture.tables import (
 from toolkit.errors import COMMAND, CaptureError
 from toolkit.files import MASKS, RAW_DATA, files_fingerprint, own_name, read_json
 from toolkit.geometry import Floats, Ints, pose_from_qt
-
-if TYPE_CHECKING:
-    import pycolmap
 
 log = logging.getLogger(__name__)
 Strings = NDArray[np.object_]
@@ -130,8 +128,6 @@ class Session:
         return f"Session({self.id}: {len(self.images)} images, {len(self.sensors)} sensors, {poses} poses)"
 
     def _repr_html_(self) -> str:
-        from toolkit.capture.images import thumbnails  # imports OpenCV
-
         rows = self.camera_rows
         sample = rows[np.unique(np.linspace(0, len(rows) - 1, min(6, len(rows))).astype(int))] if len(rows) else rows
         cameras = [camera_text(self.camera(sensor)) for sensor in pd.unique(self.images["sensor_id"].iloc[rows])]
@@ -317,7 +313,7 @@ class Session:
         """Tell whether sensors.txt lists a sensor."""
         return sensor_id in self._sensor_rows
 
-    def camera(self, sensor_id: str) -> "pycolmap.Camera":
+    def camera(self, sensor_id: str) -> pycolmap.Camera:
         """Return the intrinsics of a `camera` or `depth` sensor, with any camera model of COLMAP.
 
         Raises:
@@ -332,7 +328,7 @@ class Session:
                 raise CaptureError(f"{self._sensor_table.where(row)}: sensor {sensor_id!r}: {error}") from None
         return self._cameras[sensor_id]
 
-    def cameras(self, rows: Rows = None) -> "list[pycolmap.Camera]":
+    def cameras(self, rows: Rows = None) -> list[pycolmap.Camera]:
         """Return the intrinsics of images; see `camera`."""
         return [self.camera(sensor) for sensor in self.images["sensor_id"].to_numpy()[_selection(rows)]]
 

@@ -15,12 +15,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import cv2
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import ArrayLike, NDArray
 
+from toolkit.capture.images import decode
 from toolkit.capture.names import EXPECTED_NAME, HOW_TO_ALLOW, bad_names, outside_allowed
 from toolkit.errors import COMMAND, ArtifactError, CaptureError, ImageError
 from toolkit.files import write_atomic
@@ -533,10 +535,6 @@ def read_depth(path: str | Path) -> NDArray[np.float32]:
     The largest number, 65535, means unknown, too, as in 7-Scenes. Raise CaptureError if the file cannot be read or is
     not a 16-bit image.
     """
-    import cv2
-
-    from toolkit.capture.images import decode
-
     try:
         depth = decode(path, cv2.IMREAD_UNCHANGED)
         if depth.dtype != np.uint16 or depth.ndim != 2:
@@ -550,8 +548,6 @@ def read_depth(path: str | Path) -> NDArray[np.float32]:
 
 def write_depth(path: str | Path, depth_m: ArrayLike) -> None:
     """Write a depth map (H, W), meters, as a 16-bit PNG in millimeters; depth beyond 65.5 m becomes 0, unknown."""
-    import cv2
-
     millimeters = np.round(np.asarray(depth_m, np.float64) * DEPTH_SCALE)
     in_range = (millimeters >= 0) & (millimeters < UNKNOWN_DEPTH)  # False for NaN
     done, png = cv2.imencode(".png", np.where(in_range, millimeters, 0).astype(np.uint16))
