@@ -359,10 +359,15 @@ class Session:
             first = pc.if_else(in_folder, pc.list_element(parts, 0), self.id)  # the id if in no folder
             self._checked(pc.unique(first).to_pylist(), "images.txt")
             return first.to_numpy(zero_copy_only=False)
-        subsessions = np.full(len(self.images), "", object)
+        return self.subsession_by_prefix(*columns)
+
+    def subsession_by_prefix(self, *columns: Any) -> Strings:
+        """Return the subsession (n,) that is the longest prefix of a text in a column (n,), "" without any."""
+        subsessions = np.full(len(columns[0]), "", object)
         for name in sorted(self.subsessions, key=len):
             for column in columns:
-                subsessions[pc.starts_with(column, f"{name}/").to_numpy(zero_copy_only=False)] = name
+                found = pc.starts_with(as_strings(column), f"{name}/")
+                subsessions[found.to_numpy(zero_copy_only=False)] = name
         return subsessions
 
     @property

@@ -138,7 +138,7 @@ def recordings_of(session: Session, odometry: Trajectory) -> dict[str, Ints]:
     A recording is a subsession, or one device if several devices move in the subsession. Of several poses of a device
     at the same time, the first counts.
     """
-    subsessions, recordings = subsessions_of(session, odometry.device_ids), dict[str, Ints]()
+    subsessions, recordings = session.subsession_by_prefix(odometry.arrow_ids), dict[str, Ints]()
     names, times = device_names(odometry.timestamps, odometry.device_ids), odometry.timestamps
     repeated = pd.DataFrame({"device": names, "timestamp": times}).duplicated().to_numpy()
     for name in dict.fromkeys(subsessions.tolist()):
@@ -156,14 +156,6 @@ def device_names(timestamps: Ints, device_ids: NDArray[np.object_]) -> NDArray[n
     """Return device names (N,) that do not change with time: some ids of rigs and sensors contain the timestamp."""
     pairs = zip(device_ids.tolist(), timestamps.tolist(), strict=True)
     return np.array([device.replace(str(time), "") for device, time in pairs], object)
-
-
-def subsessions_of(session: Session, device_ids: NDArray[np.object_]) -> NDArray[np.object_]:
-    """Return the subsession (N,) of each device, "" for none."""
-    subsessions = np.full(len(device_ids), "", object)
-    for name in sorted(session.subsessions, key=len):
-        subsessions[[device.startswith(f"{name}/") for device in device_ids]] = name
-    return subsessions
 
 
 @dataclass(frozen=True)
