@@ -48,13 +48,11 @@ _CGROUPS = Path("/sys/fs/cgroup")  # file names differ between versions 2 and 1
 HEADER_ERRORS = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
 # Numbers of the EXIF tags, and the length in millimeters of each value of FocalPlaneResolutionUnit.
 ORIENTATION, _EXIF, _TIME, _SUBSECOND, _ZONE = 0x0112, 0x8769, 0x9003, 0x9291, 0x9011
-_FOCAL_MM, _FOCAL_35MM, _WIDTH, _HEIGHT = 0x920A, 0xA405, 0xA002, 0xA003
+_MAKE, _MODEL, _FOCAL_MM, _FOCAL_35MM, _WIDTH, _HEIGHT = 0x010F, 0x0110, 0x920A, 0xA405, 0xA002, 0xA003
 _PLANE_X, _PLANE_UNIT = 0xA20E, 0xA210
 _UNIT_MM = {0.0: 25.4, 2.0: 25.4, 3.0: 10.0, 4.0: 1.0}  # 0, a missing tag, means inches
 _MASK_DEPTH = 4  # largest number of folders and files in the path of an image below the folder of images
 NO_FILE = "no such file"
-EXIF_CAMERA = (0x010F, 0x0110, _FOCAL_MM, _FOCAL_35MM)
-"""EXIF tags that distinguish cameras: make, model and focal lengths."""
 _FILM_DIAGONAL_MM = float(np.hypot(36, 24))
 CAMERA_TYPES = ("camera", "depth")  # sensor types with intrinsics; only `camera` takes images
 WIDE = ("FISHEYE", "FOV", "EUCM")  # ends of the names of models for fields of view of 180 degrees and more
@@ -335,7 +333,7 @@ def read_number(exif: Mapping[int, Any], tag: int) -> float:
 
 def exif_key(exif: Mapping[int, Any]) -> tuple[str, ...]:
     """Return make, model and focal lengths of a camera, empty where EXIF has none."""
-    return tuple(str(exif.get(tag, "")) for tag in EXIF_CAMERA)
+    return tuple(str(exif.get(tag, "")) for tag in (_MAKE, _MODEL, _FOCAL_MM, _FOCAL_35MM))
 
 
 class GuessedCamera(NamedTuple):
