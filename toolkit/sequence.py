@@ -44,7 +44,6 @@ from toolkit.sequences.odometry import (
     cut,
     device_names,
     recordings_of,
-    subsessions_of,
     vote_weights,
     with_measured_drift,
 )
@@ -373,7 +372,7 @@ def _pieces(session: Session, singles: _SingleQueries, settings: SequenceSetting
     poses = odometry.world_from_device
     has_frame = odometry.index.find(queries["timestamp"].to_numpy(), as_strings(queries["device_id"])) >= 0
     times, ids = (queries.loc[~has_frame, name].to_numpy() for name in ("timestamp", "device_id"))
-    within, names = subsessions_of(session, ids), device_names(times, ids)
+    within, names = session.subsession_by_prefix(ids), device_names(times, ids)
     for recording, rows in recordings_of(session, odometry).items():
         own = np.flatnonzero((within == recording) | (names == recording))
         whole = Odometry(odometry.timestamps[rows], poses[rows])

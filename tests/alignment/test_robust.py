@@ -6,7 +6,6 @@ from scipy.spatial.transform import Rotation
 
 from toolkit import geometry
 from toolkit.alignment.robust import PoseMean, robust_mean_pose
-from toolkit.alignment.similarity import AlignmentError
 
 NOISE = np.diag([np.radians(1.0) ** 2 / 3] * 3 + [0.05**2 / 3] * 3)
 
@@ -58,14 +57,12 @@ def test_mean_follows_a_change_of_the_world_and_the_order() -> None:
 def test_mean_leaves_out_what_is_far() -> None:
     pose, poses = scattered(8, 44)
     poses[[0, 5, 7]] = random_poses(3, 45, spread_m=5)
-    poses[2, 0, 0] = np.nan
     mean = mean_of(poses)
-    np.testing.assert_array_equal(np.flatnonzero(mean.consistent), [1, 3, 4, 6])
+    np.testing.assert_array_equal(np.flatnonzero(mean.consistent), [1, 2, 3, 4, 6])
     degrees, meters = geometry.pose_error(mean.world_from_cam, pose)
     assert degrees < 2
     assert meters < 0.1
     assert "0, 5, 7 left out: far" in mean.reason
-    assert "2 left out: not finite" in mean.reason
 
 
 def test_two_camps_of_poses_and_opposite_rotations_are_undecided() -> None:
@@ -104,16 +101,3 @@ def test_covariances_weigh_and_are_widened_to_the_spread() -> None:
     square = np.diag([np.radians(0.6) ** 2 / 3] * 3 + [0.03**2 / 3] * 3)
     widened = robust_mean_pose(poses, covariances=np.stack([square] * 10))
     assert 1.5 < np.trace(widened.covariance) / np.trace(square / 10) < 5
-
-
-def test_bad_hypotheses_are_named() -> None:
-    poses = random_poses(2, 49)
-    for arguments, message in (
-        ((np.zeros((0, 4, 4)), np.zeros((0, 6, 6))), "None of 0 hypotheses"),
-        ((np.full((2, 4, 4), np.nan), [NOISE] * 2), "None of 2 hypotheses"),
-        ((-poses, [NOISE] * 2), r"world_from_cams\[0\]"),
-        ((poses, np.zeros((2, 6, 6))), r"covariances\[0\]"),
-        ((poses, np.zeros((2, 3, 3))), "covariances has shape"),
-    ):
-        with pytest.raises(AlignmentError, match=message):
-            robust_mean_pose(*arguments)

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from toolkit.__main__ import app
 from toolkit.capture import Capture, Session
 from toolkit.capture.check import check_capture
-from toolkit.capture.images import exif_camera, read_image, read_number
+from toolkit.capture.images import camera_from_exif, read_header, read_image, read_number
 from toolkit.errors import CaptureError, ManifestError
 from toolkit.exchange.interchange import import_colmap, import_images
 from toolkit.geometry import invert, make_pose, pose_from_qt, qt_from_pose, quaternion_to_rotation
@@ -556,7 +556,7 @@ def test_cameras_come_from_a_file_or_the_table(folder: Path, tmp_path: Path) -> 
     ],
 )
 def test_a_focal_length_is_guessed_from_exif(tmp_path: Path, tags: dict[int, object], focal: float, how: str) -> None:
-    camera, said, cropped = exif_camera(save(tmp_path / "x.jpg", tags=tags))
+    camera, said, cropped = camera_from_exif(*read_header(save(tmp_path / "x.jpg", tags=tags)))
     assert not cropped
     assert camera.params.tolist() == pytest.approx([focal, 32, 24], rel=1e-12)
     assert said.startswith("a guess from EXIF (")
@@ -707,7 +707,7 @@ def test_a_crop_keeps_the_focal_length_of_the_whole_image(tmp_path: Path) -> Non
     whole = 28 * np.hypot(128, 96) / np.hypot(36, 24)
     sizes = {"crop": ((64, 30), whole), "turned": ((96, 128), whole), "small": ((64, 48), whole / 2)}
     for name, (size, expected) in sizes.items():
-        camera, said, cropped = exif_camera(save(tmp_path / f"{name}.jpg", size, tags))
+        camera, said, cropped = camera_from_exif(*read_header(save(tmp_path / f"{name}.jpg", size, tags)))
         assert camera.params[0] == pytest.approx(expected)
         assert ("cropped" in said) == cropped == (name == "crop")
 

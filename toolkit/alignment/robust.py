@@ -115,31 +115,24 @@ def robust_mean_pose(world_from_cams: ArrayLike, covariances: ArrayLike) -> Pose
     """Return the robust mean of pose hypotheses on SE(3), and its covariance.
 
     The hypotheses are taken as independent. The start is the hypothesis closest to all of them. Iteratively reweighted
-    least squares in its tangent space refine it, with Huber weights within the gate and 0 beyond. Raise AlignmentError,
-    with the index, if there is no hypothesis, a shape is wrong, a matrix is not a rigid pose, or a covariance is not
-    positive definite.
+    least squares in its tangent space refine it, with Huber weights within the gate and 0 beyond.
 
     Args:
-        world_from_cams: (H, 4, 4); hypotheses that are not finite are left out.
-        covariances: (H, 6, 6), see `PoseMean.covariance`. A common factor of at least 1 widens them to explain the
-            spread.
+        world_from_cams: (H, 4, 4), finite rigid poses, at least one.
+        covariances: (H, 6, 6), positive definite, see `PoseMean.covariance`. A common factor of at least 1 widens them
+            to explain the spread.
     """
-    poses, finite = rigid_poses(world_from_cams, "world_from_cams")
-    usable = np.flatnonzero(finite)
-    if not len(usable):
-        raise AlignmentError(f"None of {len(poses)} hypotheses is finite: expected at least one.")
-    information = _information(covariances, len(poses))
-    notes = [] if finite.all() else [f"hypotheses {listed(~finite)} left out: not finite"]
-    pose, covariance, inside = _mean(poses[usable], information[usable])
-    consistent, left_out = np.zeros(len(poses), bool), np.zeros(len(poses), bool)
-    consistent[usable], left_out[usable] = inside, ~inside
-    if left_out.any():
-        notes.append(f"hypotheses {listed(left_out)} left out: far from the others")
-        rivals = int(_mean(poses[left_out], information[left_out])[2].sum())
+    poses, information = np.array(world_from_cams, np.float64), np.linalg.inv(np.asarray(covariances, np.float64))
+    poses[:, :3, :3] = nearest_rotation(poses[:, :3, :3])
+    pose, covariance, inside = _mean(poses, information)
+    notes = []
+    if not inside.all():
+        notes.append(f"hypotheses {listed(~inside)} left out: far from the others")
+        rivals = int(_mean(poses[~inside], information[~inside])[2].sum())
         if rivals > 0.9 * inside.sum():
             notes.append(f"{int(inside.sum())} hypotheses agree, and {rivals} others elsewhere: undecided")
             covariance = np.diag(np.full(6, np.inf))
-    return PoseMean(pose, covariance, consistent, "; ".join(notes))
+    return PoseMean(pose, covariance, inside, "; ".join(notes))
 
 
 def _mean(poses: Floats, information: Floats) -> tuple[Floats, Floats, Bools]:
@@ -168,13 +161,3 @@ def _mean(poses: Floats, information: Floats) -> tuple[Floats, Floats, Bools]:
     free = 6 * (int(inside.sum()) - 1)
     squared = np.einsum("h,hi,hij,hj->", share, errors, information, errors)
     return mean, np.linalg.inv(joint) * max(1.0, squared / free if free else 1.0), inside
-
-
-def _information(covariances: ArrayLike, count: int) -> Floats:
-    matrices = np.asarray(covariances, np.float64)
-    if matrices.shape != (count, 6, 6):
-        raise AlignmentError(f"covariances has shape {matrices.shape}: expected ({count}, 6, 6).")
-    for index, matrix in enumerate(matrices):
-        if not np.isfinite(matrix).all() or np.linalg.eigvalsh(matrix).min() <= 0:
-            raise AlignmentError(f"covariances[{index}] is not finite and positive definite.")
-    return np.asarray(np.linalg.inv(matrices), np.float64)

@@ -320,24 +320,24 @@ def align_to_map(
         model[usable], world[usable], weight[usable] / weight[usable].mean(), center_noise_m, rotation_noise_deg
     )
     depth = ratios.estimate(None)
-    best = problem.search(depth)
+    best, members = problem.search(depth)
     consistent, excluded = np.zeros(len(model), bool), np.zeros(len(model), bool)
-    consistent[usable], excluded[usable] = best.consistent, ~best.consistent
+    consistent[usable], excluded[usable] = members > 0, members == 0
     num_rivals, undecided = 0, []
     if excluded.any():
         notes.append(f"references {listed(excluded)} left out: their poses contradict the others'")
-        rest = problem.subset(~best.consistent)
+        others = problem.weight[members == 0]
+        rest = _Problem(model[excluded], world[excluded], others, center_noise_m, rotation_noise_deg)
         # Excluded references agree with each other only within twice the noise of the others.
-        noise = best.state.with_noise(2.0)
-        rival = rest.search(depth, (float(noise.rotation_noise[0]), float(noise.center_noise[0])))
-        num_rivals = int(rival.consistent.sum())
-        if rest.weight[rival.consistent].sum() > 0.9 * problem.weight[best.consistent].sum():
+        _, rivals = rest.search(depth, (2 * float(best.rotation_noise[0]), 2 * float(best.center_noise[0])))
+        num_rivals = int((rivals > 0).sum())
+        if others[rivals > 0].sum() > 0.9 * problem.weight[members > 0].sum():
             counts = f"{consistent.sum()} references agree, and {num_rivals} others on another alignment"
             undecided = [f"{counts}: undecided"]
         if ratios.grouped:
             depth = ratios.estimate(consistent)
     notes += ratios.notes
-    alignment = replace(problem.solve(best, depth, notes), consistent=consistent, num_rivals=num_rivals)
+    alignment = replace(problem.solve(best, members, depth, notes), consistent=consistent, num_rivals=num_rivals)
     if undecided:
         alignment = replace(alignment, reason="; ".join([*notes, *undecided]), **_UNKNOWN)
     return alignment
@@ -403,10 +403,8 @@ class _Problem:
 
     def __init__(self, model: Floats, world: Floats, weight: Floats, center_noise_m: float, rotation_noise_deg: float):
         self.weight = weight
-        self.expected = (center_noise_m, rotation_noise_deg)
         self.world_from_model = world[:, :3, :3] @ np.swapaxes(model[:, :3, :3], -1, -2)  # rotation from each camera
         self.flat_rotations = self.world_from_model.reshape(-1, 9)
-        self.model, self.world = model, world
         # Centers in the model (m) and in the world (c), relative to a middle reference: large coordinates lose digits.
         self.origin_m, self.origin_c = _middle(model[:, :3, 3]), _middle(world[:, :3, 3])
         self.m, self.c = model[:, :3, 3] - self.origin_m, world[:, :3, 3] - self.origin_c
@@ -425,11 +423,13 @@ class _Problem:
         # Scale to use where the centers do not determine it.
         self.rough_scale = float(np.median(ratios)) if apart.any() else 1.0
 
-    def subset(self, kept: Bools) -> _Problem:
-        return _Problem(self.model[kept], self.world[kept], self.weight[kept], *self.expected)
+    def search(
+        self, depth: ScaleEstimate | None, noise: tuple[float, float] | None = None
+    ) -> tuple[_Similarities, Floats]:
+        """Return the most likely similarity, and the probability (M,) that each reference is correct, 0 if left out.
 
-    def search(self, depth: ScaleEstimate | None, noise: tuple[float, float] | None = None) -> _Candidate:
-        """Return the most likely similarity; `noise` (rotation, center) fixes the noise per axis."""
+        `noise` (rotation, center) fixes the noise per axis.
+        """
         alone, (first, second) = np.eye(len(self.m)), np.triu_indices(len(self.m), 1)
         members = np.vstack([alone[first] + alone[second], alone])
         state = self.fit(members, self.opening(members), None)
@@ -444,10 +444,13 @@ class _Problem:
             state = self.fit(members, state, depth)
             residuals = self.residuals(state)
             if noise is None:
-                state = state.with_noise_of(self, members, residuals)
+                angle, distance = ((members * values) @ self.weight for values in residuals)
+                free = 3 * np.maximum(members.sum(axis=1) - 1, 0)
+                rotation_noise = np.sqrt(noise_variance(angle, free, self.rotation_prior))
+                center_noise = np.sqrt(noise_variance(distance, np.maximum(free - 1, 0), self.center_prior))
             else:
                 rotation_noise, center_noise = (np.full(len(state.scale), value) for value in noise)
-                state = replace(state, rotation_noise=rotation_noise, center_noise=center_noise)
+            state = replace(state, rotation_noise=rotation_noise, center_noise=center_noise)
             before = members
             scores, members = self.score(state, residuals)
             best = int(np.argmax(scores))
@@ -456,7 +459,7 @@ class _Problem:
         consistent = members[best] > 0.5
         if not consistent.any():
             consistent[np.argmax(members[best])] = True
-        return _Candidate(state[best : best + 1], np.where(consistent, np.maximum(members[best], 0.5), 0.0), consistent)
+        return state[best : best + 1], np.where(consistent, np.maximum(members[best], 0.5), 0.0)
 
     def opening(self, members: Floats) -> _Similarities:
         """Return starting points for the fit of members (K, M): their mean rotations, and the expected noise."""
@@ -532,12 +535,12 @@ class _Problem:
             likelihood = likelihood - (np.log(noise / expected) / NOISE_FACTOR) ** 2 / 2
         return likelihood, np.exp(right - either)
 
-    def solve(self, best: _Candidate, depth: ScaleEstimate | None, notes: list[str]) -> Alignment:
-        """Return the weighted least squares alignment of a candidate's consistent references, with its uncertainty."""
-        state, share = best.state, best.members * self.weight
+    def solve(self, state: _Similarities, members: Floats, depth: ScaleEstimate | None, notes: list[str]) -> Alignment:
+        """Return the weighted least squares alignment of the consistent references, with its uncertainty."""
+        share = members * self.weight
         rotation, scale = state.rotation[0], float(state.scale[0])
         rotation_noise, center_noise = float(state.rotation_noise[0]), float(state.center_noise[0])
-        count = float(best.members.sum())
+        count = float(members.sum())
         c0, m0 = share @ self.c / share.sum(), share @ self.m / share.sum()
         c, m = self.c - c0, self.m - m0
         square_c = float(share @ (c**2).sum(axis=1))
@@ -555,7 +558,7 @@ class _Problem:
             if estimate is not None and scale_std <= MAX_SCALE_STD:
                 scale = estimate.value
             else:
-                scale = float(self.fit(best.members[None], fitted, depth).scale[0])
+                scale = float(self.fit(members[None], fitted, depth).scale[0])
             fitted = replace(fitted, rotation=rotation[None], scale=np.array([scale]))
             angle, distance = (values[0] @ share for values in self.residuals(fitted))
             # The rotation's degrees of freedom are split between orientations and baselines by information.
@@ -578,10 +581,10 @@ class _Problem:
         squared_m2 = ((c - scale * m @ rotation.T) ** 2).sum(axis=1)
         return Alignment(
             world_from_model=Sim3(scale, rotation, translation),
-            consistent=best.consistent,
+            consistent=members > 0,
             scale_std=scale_std if known else np.inf,
             rotation_std_deg=float(np.degrees(np.sqrt(np.trace(covariance)))),
-            rmse_m=float(np.sqrt(squared_m2[best.consistent].mean())),
+            rmse_m=float(np.sqrt(squared_m2[members > 0].mean())),
             reason="; ".join(notes),
             num_rivals=0,
             centroid_m=self.origin_c + c0,
@@ -612,25 +615,6 @@ class _Similarities:
 
     def with_noise(self, factor: float) -> _Similarities:
         return replace(self, rotation_noise=self.rotation_noise * factor, center_noise=self.center_noise * factor)
-
-    def with_noise_of(self, problem: _Problem, members: Floats, residuals: tuple[Floats, Floats]) -> _Similarities:
-        angle, distance = ((members * values) @ problem.weight for values in residuals)
-        free = 3 * np.maximum(members.sum(axis=1) - 1, 0)
-        return replace(
-            self,
-            rotation_noise=np.sqrt(noise_variance(angle, free, problem.rotation_prior)),
-            center_noise=np.sqrt(noise_variance(distance, np.maximum(free - 1, 0), problem.center_prior)),
-        )
-
-
-@dataclass(frozen=True)
-class _Candidate:
-    """One similarity and the references that are consistent with it."""
-
-    state: _Similarities
-    members: Floats
-    """(M,) probability that each reference is correct, 0 if left out."""
-    consistent: Bools
 
 
 def _middle(points: Floats) -> Floats:

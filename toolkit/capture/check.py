@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -237,20 +238,13 @@ class _SessionCheck:
                 yield is_known & without, f"keyframe without ground truth {shown}", WARNING
 
     def _check_cameras(self) -> None:
-        verdicts: dict[tuple[str, str], str | tuple[int, int]] = {}
-        rows = self.rows["sensors.txt"]
+        rows, parsed = self.rows["sensors.txt"], cache(parse_camera)  # a phone may have a sensor per image
         for line, sensor, _, kind, params in rows[rows["sensor_type"].isin(CAMERA_TYPES)].itertuples(name=None):
-            if (kind, params) not in verdicts:
-                try:
-                    camera = parse_camera(kind, params)
-                    verdicts[kind, params] = camera.width, camera.height
-                except ValueError as error:
-                    verdicts[kind, params] = str(error).rstrip(".")
-            verdict = verdicts[kind, params]
-            if isinstance(verdict, str):
-                self._add("sensors.txt", line, verdict)
-            else:
-                self.sizes[sensor] = verdict
+            try:
+                camera = parsed(kind, params)
+                self.sizes[sensor] = camera.width, camera.height
+            except ValueError as error:
+                self._add("sensors.txt", line, str(error).rstrip("."))
 
     def _check_steps(self) -> None:
         """Report times that seem to have another unit than microseconds; those that imports made are from EXIF."""
@@ -279,18 +273,17 @@ class _SessionCheck:
         for row, target in self.session.links_out(rows[path]).items():
             inside[row], shown = False, f"{RAW_DATA}/{rows[path].iloc[row]} is a link to {target}"
             self._add(file, rows.index[row], f"{shown}, outside of the capture; {HOW_TO_ALLOW}")
-        exist = np.array([os.path.lexists(f"{self.session.path}/{RAW_DATA}/{name}") for name in rows[path]], bool)
-        self.missing[file] = int((~exist & inside).sum())
+        files = [f"{self.session.path}/{RAW_DATA}/{name}" for name in rows[path]]
+        exist = np.array([os.path.lexists(name) for name in files], bool)
+        gone = exist & ~np.array([os.path.exists(name) for name in files], bool)  # noqa: PTH110
+        self.missing[file] = int(((~exist & inside) | gone).sum())
         self._add_rows(file, ~exist & inside, f"missing file {RAW_DATA}/{{{path}}}")
-        listed = rows[path].to_numpy()
-        gone = np.zeros(len(rows), bool)
-        gone[exist] = [not os.path.exists(f"{self.session.path}/{RAW_DATA}/{name}") for name in listed[exist]]  # noqa: PTH110
         if gone.any():
-            self.missing[file] += int(gone.sum())
-            lost = os.readlink(f"{self.session.path}/{RAW_DATA}/{listed[gone][0]}")  # noqa: PTH115
+            first = int(np.argmax(gone))
+            lost = os.readlink(files[first])  # noqa: PTH115
             found = f"{gone.sum()} of {len(rows)} files are links to files that are gone, such as {lost}"
             do = "Move them back, or import again with --replace; --images copy does not depend on them"
-            self._add(file, int(rows.index[gone][0]), f"{found}. {do}")
+            self._add(file, rows.index[first], f"{found}. {do}")
         self._check_content(file, rows[exist & inside & ~gone])
 
     def _check_content(self, file: str, rows: pd.DataFrame) -> None:
@@ -369,18 +362,16 @@ class _SessionCheck:
         sizes = self.rig_ids.value_counts()
         span = f"{sizes.min()} to {sizes.max()}" if sizes.nunique() > 1 else f"{sizes.min()}"
         add("rigs", None if session.rigs is None else len(sizes), f"{span} sensors each" if len(sizes) else "")
-        for what, trajectory in (("poses", session.trajectory), ("ground truth", session.ground_truth)):
+        lacking = f"no {ALIGNED}: these queries cannot be evaluated" if session.split == "query" else ""
+        source = "from trajectories.txt" if session.ground_truth is session.trajectory else ""
+        odometry = "" if session.split == "map" else "odometry of the device, not used as ground truth"
+        for what, trajectory, without, note in (("poses", session.trajectory, "", odometry),
+                                                ("ground truth", session.ground_truth, lacking, source)):  # fmt: skip
             if trajectory is None:
-                lacks_truth = what == "ground truth" and session.split == "query"
-                add(what, None, f"no {ALIGNED}: these queries cannot be evaluated" if lacks_truth else "")
-                continue
-            posed = np.sum(trajectory.index.find(times, session.device_ids) >= 0)
-            note = ""
-            if what == "poses" and session.split != "map":
-                note = "odometry of the device, not used as ground truth"
-            elif what == "ground truth" and trajectory is session.trajectory:
-                note = "from trajectories.txt"
-            add(what, len(trajectory), f"{posed:,} of {len(times):,} images have one", note)
+                add(what, None, without)
+            else:
+                posed = np.sum(trajectory.index.find(times, session.device_ids) >= 0)
+                add(what, len(trajectory), f"{posed:,} of {len(times):,} images have one", note)
         if session.split == "map" and not self._has_errors and len(posed_images(session)[1]):
             add("up in the world", None, estimate_world_up([session]).reason)
         add("depth maps", None if session.depths is None else len(session.depths), missing("depths.txt"))

@@ -19,6 +19,7 @@ from typing import Any, BinaryIO, NamedTuple, TypeVar
 import cv2
 import numpy as np
 import PIL.Image
+import psutil
 import pycolmap
 from numpy.typing import ArrayLike, NDArray
 from PIL import JpegImagePlugin, PngImagePlugin
@@ -47,13 +48,11 @@ _CGROUPS = Path("/sys/fs/cgroup")  # file names differ between versions 2 and 1
 HEADER_ERRORS = (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError)
 # Numbers of the EXIF tags, and the length in millimeters of each value of FocalPlaneResolutionUnit.
 ORIENTATION, _EXIF, _TIME, _SUBSECOND, _ZONE = 0x0112, 0x8769, 0x9003, 0x9291, 0x9011
-_FOCAL_MM, _FOCAL_35MM, _WIDTH, _HEIGHT = 0x920A, 0xA405, 0xA002, 0xA003
+_MAKE, _MODEL, _FOCAL_MM, _FOCAL_35MM, _WIDTH, _HEIGHT = 0x010F, 0x0110, 0x920A, 0xA405, 0xA002, 0xA003
 _PLANE_X, _PLANE_UNIT = 0xA20E, 0xA210
 _UNIT_MM = {0.0: 25.4, 2.0: 25.4, 3.0: 10.0, 4.0: 1.0}  # 0, a missing tag, means inches
 _MASK_DEPTH = 4  # largest number of folders and files in the path of an image below the folder of images
 NO_FILE = "no such file"
-EXIF_CAMERA = (0x010F, 0x0110, _FOCAL_MM, _FOCAL_35MM)
-"""EXIF tags that distinguish cameras: make, model and focal lengths."""
 _FILM_DIAGONAL_MM = float(np.hypot(36, 24))
 CAMERA_TYPES = ("camera", "depth")  # sensor types with intrinsics; only `camera` takes images
 WIDE = ("FISHEYE", "FOV", "EUCM")  # ends of the names of models for fields of view of 180 degrees and more
@@ -177,20 +176,14 @@ def read_image(
     return image if longest is None else shrunk(image, longest)
 
 
-def pixels_of(
-    image: str | Path | NDArray[np.uint8], gray: bool = False, min_side: int | None = None
-) -> NDArray[np.uint8]:
+def pixels_of(image: Path | NDArray[np.uint8], gray: bool, min_side: int | None) -> NDArray[np.uint8]:
     """Return an image in gray, (H, W), or in color, (H, W, 3) RGB.
 
-    Raise ImageError if the file is missing or cannot be decoded, or the pixels have another shape or type.
-
     Args:
-        image: a file, see `read_image`; or pixels (H, W) or (H, W, 3) RGB uint8.
+        image: a file, see `read_image` also for the errors; or pixels (H, W) or (H, W, 3) RGB.
     """
-    if isinstance(image, str | Path):
+    if isinstance(image, Path):
         return read_image(image, gray, min_side)
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
-        raise ImageError(f"Found pixels {image.shape} {image.dtype}: expected (H, W) or (H, W, 3) uint8.")
     if gray == (image.ndim == 2):
         return image
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY if gray else cv2.COLOR_GRAY2RGB), np.uint8)
@@ -230,8 +223,6 @@ def default_workers() -> int:
     It is limited by the CPU affinity of the process, the CPU quota of its container, and the memory of the machine and
     the container, with `THREAD_BYTES` per thread.
     """
-    import psutil
-
     if (workers := os.environ.get(WORKERS, "")).isdecimal():
         return max(1, int(workers))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -342,7 +333,7 @@ def read_number(exif: Mapping[int, Any], tag: int) -> float:
 
 def exif_key(exif: Mapping[int, Any]) -> tuple[str, ...]:
     """Return make, model and focal lengths of a camera, empty where EXIF has none."""
-    return tuple(str(exif.get(tag, "")) for tag in EXIF_CAMERA)
+    return tuple(str(exif.get(tag, "")) for tag in (_MAKE, _MODEL, _FOCAL_MM, _FOCAL_35MM))
 
 
 class GuessedCamera(NamedTuple):
@@ -353,11 +344,6 @@ class GuessedCamera(NamedTuple):
     """Where the focal length is from, in words."""
     cropped: bool = False
     """The image is a part of the one that EXIF describes, so its principal point may be anywhere."""
-
-
-def exif_camera(path: Path) -> GuessedCamera:
-    """Return `camera_from_exif` of the header of an image, which is read; raise ImageError also if it cannot be."""
-    return camera_from_exif(*read_header(path))
 
 
 def camera_from_exif(size: tuple[int, int], exif: Mapping[int, Any]) -> GuessedCamera:

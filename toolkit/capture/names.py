@@ -152,13 +152,6 @@ def require_name(name: str, kind: str, place: str | Path) -> None:
         raise CaptureError(f"{place}: the {kind} {name[:40]!r}... {fault}. Rename it.")
 
 
-def roots_of(session: Path) -> list[Path]:
-    """Return the resolved folders in which the files of a session may lie: its own and its capture's."""
-    session = session.absolute()
-    in_capture = session.parent.name == "sessions"
-    return [root.resolve() for root in (session, *(session.parents[:2] if in_capture else ()))]
-
-
 def leads_out(path: Path, roots: Sequence[Path]) -> Path | None:
     """Return the target of a path, with links resolved, if it is outside of all `roots`; else None."""
     target = Path(os.path.realpath(path))

@@ -21,16 +21,17 @@ from html import escape
 from importlib import import_module
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
+import pycolmap
 from numpy.typing import ArrayLike, NDArray
 
 from toolkit.capture import names
-from toolkit.capture.images import camera_text, parse_camera
+from toolkit.capture.images import camera_text, parse_camera, thumbnails
 from toolkit.capture.names import SPLITS, in_order, require_name, session_id, session_of
 from toolkit.capture.tables import (
     ALIGNED,
@@ -50,9 +51,6 @@ from toolkit.capture.tables import (
 from toolkit.errors import COMMAND, CaptureError
 from toolkit.files import MASKS, RAW_DATA, files_fingerprint, own_name, read_json
 from toolkit.geometry import Floats, Ints, pose_from_qt
-
-if TYPE_CHECKING:
-    import pycolmap
 
 log = logging.getLogger(__name__)
 Strings = NDArray[np.object_]
@@ -132,8 +130,6 @@ class Session:
         return f"Session({self.id}: {len(self.images)} images, {len(self.sensors)} sensors, {poses} poses)"
 
     def _repr_html_(self) -> str:
-        from toolkit.capture.images import thumbnails  # imports OpenCV
-
         rows = self.camera_rows
         sample = rows[np.unique(np.linspace(0, len(rows) - 1, min(6, len(rows))).astype(int))] if len(rows) else rows
         cameras = [camera_text(self.camera(sensor)) for sensor in pd.unique(self.images["sensor_id"].iloc[rows])]
@@ -192,7 +188,10 @@ class Session:
 
     @cached_property
     def _roots(self) -> list[Path]:
-        return names.roots_of(self.path)
+        """The resolved folders in which files may lie: that of the session and its capture's."""
+        path = self.path.absolute()
+        in_capture = path.parent.name == "sessions"
+        return [root.resolve() for root in (path, *(path.parents[:2] if in_capture else ()))]
 
     # Files
 
@@ -316,7 +315,7 @@ class Session:
         """Tell whether sensors.txt lists a sensor."""
         return sensor_id in self._sensor_rows
 
-    def camera(self, sensor_id: str) -> "pycolmap.Camera":
+    def camera(self, sensor_id: str) -> pycolmap.Camera:
         """Return the intrinsics of a `camera` or `depth` sensor, with any camera model of COLMAP.
 
         Raises:
@@ -331,7 +330,7 @@ class Session:
                 raise CaptureError(f"{self._sensor_table.where(row)}: sensor {sensor_id!r}: {error}") from None
         return self._cameras[sensor_id]
 
-    def cameras(self, rows: Rows = None) -> "list[pycolmap.Camera]":
+    def cameras(self, rows: Rows = None) -> list[pycolmap.Camera]:
         """Return the intrinsics of images; see `camera`."""
         return [self.camera(sensor) for sensor in self.images["sensor_id"].to_numpy()[_selection(rows)]]
 
@@ -362,10 +361,15 @@ class Session:
             first = pc.if_else(in_folder, pc.list_element(parts, 0), self.id)  # the id if in no folder
             self._checked(pc.unique(first).to_pylist(), "images.txt")
             return first.to_numpy(zero_copy_only=False)
-        subsessions = np.full(len(self.images), "", object)
+        return self.subsession_by_prefix(*columns)
+
+    def subsession_by_prefix(self, *columns: Any) -> Strings:
+        """Return the subsession (n,) that is the longest prefix of a text in a column (n,), "" without any."""
+        subsessions = np.full(len(columns[0]), "", object)
         for name in sorted(self.subsessions, key=len):
             for column in columns:
-                subsessions[pc.starts_with(column, f"{name}/").to_numpy(zero_copy_only=False)] = name
+                found = pc.starts_with(as_strings(column), f"{name}/")
+                subsessions[found.to_numpy(zero_copy_only=False)] = name
         return subsessions
 
     @property

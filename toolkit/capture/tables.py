@@ -15,12 +15,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import cv2
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import ArrayLike, NDArray
 
+from toolkit.capture.images import decode
 from toolkit.capture.names import EXPECTED_NAME, HOW_TO_ALLOW, bad_names, outside_allowed
 from toolkit.errors import COMMAND, ArtifactError, CaptureError, ImageError
 from toolkit.files import write_atomic
@@ -169,7 +171,6 @@ def _layout(columns: Columns) -> str:
 
 
 def _parse(path: Path, data: bytes, columns: Columns, keep_extra: bool) -> TextTable:
-    """Split and convert the lines of a file."""
     texts = data.removeprefix(b"\xef\xbb\xbf").split(b"\n")  # without the byte-order mark of Windows editors
     problems: list[tuple[int, str]] = []
     if _fault(data.replace(b"\r\n", b"\n")):
@@ -239,8 +240,7 @@ def convert(column: pa.Array, kind: str) -> tuple[pa.Array, NDArray[np.bool_]]:
                 wrong[row] = True
         converted = pc.if_else(pa.array(wrong), "0", column).cast(target)
     if kind == INTEGER:  # Arrow reads 0x10 as 16
-        wrong |= pc.match_substring(column, "x").to_numpy(zero_copy_only=False)
-        wrong |= pc.match_substring(column, "X").to_numpy(zero_copy_only=False)
+        wrong |= pc.match_substring(column, "x", ignore_case=True).to_numpy(zero_copy_only=False)
     elif most is not None:
         values = np.abs(converted.to_numpy())
         wrong |= ~((values <= most) & (values < np.inf))
@@ -535,10 +535,6 @@ def read_depth(path: str | Path) -> NDArray[np.float32]:
     The largest number, 65535, means unknown, too, as in 7-Scenes. Raise CaptureError if the file cannot be read or is
     not a 16-bit image.
     """
-    import cv2
-
-    from toolkit.capture.images import decode
-
     try:
         depth = decode(path, cv2.IMREAD_UNCHANGED)
         if depth.dtype != np.uint16 or depth.ndim != 2:
@@ -552,8 +548,6 @@ def read_depth(path: str | Path) -> NDArray[np.float32]:
 
 def write_depth(path: str | Path, depth_m: ArrayLike) -> None:
     """Write a depth map (H, W), meters, as a 16-bit PNG in millimeters; depth beyond 65.5 m becomes 0, unknown."""
-    import cv2
-
     millimeters = np.round(np.asarray(depth_m, np.float64) * DEPTH_SCALE)
     in_range = (millimeters >= 0) & (millimeters < UNKNOWN_DEPTH)  # False for NaN
     done, png = cv2.imencode(".png", np.where(in_range, millimeters, 0).astype(np.uint16))

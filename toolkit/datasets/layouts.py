@@ -121,13 +121,6 @@ def _pose_of(image: Path) -> Floats | str:
     return rows if is_pose and abs(np.linalg.det(rows[:3, :3]) - 1) < 0.01 else f"{path.name}: no pose in it"
 
 
-def _size(path: Path) -> tuple[int, int] | str:
-    try:
-        return stored_size(path)
-    except ImageError as error:
-        return str(error)
-
-
 def _nearest_pose(path: Path, unit: str) -> Callable[[int], Floats | str]:
     """Return a function that returns the pose of a list that is nearest to a time, microseconds."""
     track = read_track(path, unit)
@@ -146,6 +139,14 @@ def _first(paths: Iterable[Path], folder: Path, expected: str) -> Path:
     if path is None:
         raise CaptureError(f"{folder}: no {expected}. It is part of the data set: unpack all of it.")
     return path
+
+
+def _first_size(paths: Iterable[Path], folder: Path, expected: str) -> tuple[int, int]:
+    first = _first(paths, folder, expected)
+    try:
+        return stored_size(first)
+    except ImageError as error:
+        raise CaptureError(f"{first}: {error}.") from None
 
 
 # The layouts
@@ -170,10 +171,7 @@ def _seven_scenes(folder: Path) -> tuple[Path, list[ListedImage]]:
 
 
 def _twelve_scenes(folder: Path) -> tuple[Path, list[ListedImage]]:
-    first = _first((folder / "data").glob("*.color.jpg"), folder, "data/*.color.jpg")
-    size = _size(first)
-    if isinstance(size, str):
-        raise CaptureError(f"{first}: {size}.")
+    size = _first_size((folder / "data").glob("*.color.jpg"), folder, "data/*.color.jpg")
     camera = camera_at(folder / "info.txt", _twelve_scenes_camera(folder, "Color", size))
     # The first sequence is for tests: `sequence0 [frames=357]  [start=0 ; end=356]`.
     ranges = [words for _, words in lines_of(folder / "split.txt") if words[0].startswith("sequence")]
@@ -197,9 +195,9 @@ def _twelve_scenes_camera(folder: Path, which: str, size: tuple[int, int]) -> st
 
 
 def _depth_of_twelve_scenes(folder: Path) -> dict[str, Any]:
-    first = next((folder / "data").glob("*.depth.png"), None)
-    size = None if first is None else _size(first)
-    if not isinstance(size, tuple):
+    try:
+        size = _first_size((folder / "data").glob("*.depth.png"), folder, "data/*.depth.png")
+    except CaptureError:  # there is no depth map
         return {}
     return {"depth": folder, "depth_camera": _twelve_scenes_camera(folder, "Depth", size)}
 
@@ -227,14 +225,13 @@ def _cambridge(folder: Path) -> tuple[Path, list[ListedImage]]:
             center, quaternion = np.split(numbers_of(where, words, 7), [3])
             rotation = pose_from_qt([*quaternion / np.linalg.norm(quaternion), 0, 0, 0])[:3, :3].T
             camera: pycolmap.Camera | str
-            size = _size(folder / name)
-            if isinstance(size, str):
-                camera = size
-            else:
+            try:
+                width, height = size = stored_size(folder / name)
                 focal = focals.get(Path(name).with_suffix("").as_posix(), usual)
                 focal = focal if np.isfinite(focal) else 1670.0 * max(size) / 1920  # that of the phone, as often used
-                width, height = size
                 camera = camera_at(where, f"SIMPLE_PINHOLE, {width}, {height}, {focal}, {width / 2}, {height / 2}")
+            except ImageError as error:
+                camera = str(error)
             images.append(ListedImage(name, split, camera, make_pose(rotation, center)))
     return folder, images
 
@@ -256,7 +253,6 @@ def _eth3d(folder: Path) -> tuple[Path, list[ListedImage]]:
 
 
 def _of_model(model: ColmapModel, split: str) -> list[ListedImage]:
-    """Return the images of a COLMAP model."""
     images = []
     for image in model.images.values():
         camera, pose = model.cameras.get(image.camera_id, "its camera is not in the model"), image.cam_from_world
@@ -290,16 +286,13 @@ def _kitti(folder: Path) -> tuple[Path, list[ListedImage]]:
     projection = numbers_of(*projections[f"P{number}"], 12).reshape(3, 4)
     cam_from_gray = make_pose(np.eye(3), np.linalg.solve(projection[:, :3], projection[:, 3]))
     files = sorted((folder / f"image_{number}").glob("*.png"))
-    size = _size(files[0]) if files else "no image"
-    if isinstance(size, str):
-        raise CaptureError(f"{folder / f'image_{number}'}: {size}.")
+    size = _first_size(files, folder, f"image_{number}/*.png")
     fx, fy, cx, cy = projection[0, 0], projection[1, 1], projection[0, 2], projection[1, 2]
     camera = camera_at(folder / "calib.txt", f"PINHOLE, {size[0]}, {size[1]}, {fx}, {fy}, {cx}, {cy}")
     images = []
     for file in files:
         row = int(file.stem)
-        known = row < min(len(poses), len(times))
-        known = known and bool(np.isfinite(poses[row]).all())
+        known = row < min(len(poses), len(times)) and bool(np.isfinite(poses[row]).all())
         pose = poses[row] @ invert(cam_from_gray) if known else f"not in {truth}"
         name, time_us = file.relative_to(folder).as_posix(), round(times[row] * 1e6) if known else None
         images.append(ListedImage(name, "", camera, pose, time_us))

@@ -154,9 +154,8 @@ def inverse(a_from_b: pycolmap.Rigid3d) -> Floats:
 
 def _set_images(model: ColmapModel, rows: Mapping[int, tuple[str, int, Sequence[float]]]) -> None:
     """Set the images of a model: name, camera and pose by id. All poses are converted at once, which is faster."""
-    for (image_id, (name, camera_id, _)), pose in zip(
-        rows.items(), _poses([values for _, _, values in rows.values()]), strict=True
-    ):
+    poses = _poses([values for _, _, values in rows.values()])
+    for (image_id, (name, camera_id, _)), pose in zip(rows.items(), poses, strict=True):
         model.images[image_id] = ModelImage(name, camera_id, pose)
 
 

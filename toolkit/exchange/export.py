@@ -47,7 +47,6 @@ from toolkit.files import (
     read_references,
     read_sidecar,
     require_current,
-    require_whole,
     write_atomic,
     write_folder,
     write_text,
@@ -296,10 +295,9 @@ def _listed(name: str, names: str, path: Path) -> str:
 
 
 def _require_poses(path: Path) -> Path:
-    """Return the path of a result of the localize stage. Raise ArtifactError if it is missing or damaged."""
+    """Return the path of a result of the localize stage. Raise ArtifactError if it is missing or outdated."""
     if not path.is_file():
         raise ArtifactError(f"No poses: {path} is missing. {_LOCALIZE}")
-    require_whole(path, of=path.with_suffix(".txt"))
     require_current(path.with_suffix(".txt"), "localize", missing=False)
     return path
 

@@ -11,13 +11,14 @@ import pycolmap
 
 from toolkit.alignment.similarity import align_to_map
 from toolkit.capture import Session
-from toolkit.capture.images import HEADER_ERRORS, ORIENTATION, read_number
+from toolkit.capture.images import HEADER_ERRORS, ORIENTATION, read_number, turned_from_cam
 from toolkit.capture.session import IMPORT_RECORD, RECONSTRUCTION_RECORD
 from toolkit.capture.upright import up_of_cameras
 from toolkit.errors import CaptureError, ManifestError
+from toolkit.exchange.colmap_model import inverse
 from toolkit.exchange.recordings import numbers_in, read_csv
 from toolkit.files import IMPORTED, own_name, read_json
-from toolkit.geometry import Floats, invert, make_pose
+from toolkit.geometry import Floats, invert
 
 MAX_ERRORS_M = (0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Limits of the error of a known position; the smallest that `MOST` of the positions meet is used."""
@@ -234,10 +235,7 @@ def gps_position(path: Path) -> tuple[float, float, float] | None:
 
 def _upright(image: pycolmap.Image, quarter_turns: int) -> Floats:
     """Return world_from_cam (4, 4) of the camera as if it had been held upright."""
-    pose = image.cam_from_world().inverse()
-    cos, sin = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarter_turns]
-    turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
-    return make_pose(pose.rotation.matrix() @ turn, pose.translation)
+    return inverse(image.cam_from_world()) @ invert(turned_from_cam(quarter_turns))
 
 
 def _rotation_to_z(up: Floats) -> Floats:

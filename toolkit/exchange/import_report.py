@@ -139,7 +139,7 @@ def new_manifest(
     `thresholds`, degrees and meters, those of the template.
 
     Raises:
-        ManifestError: an invalid name, the file exists already, or there is no template.
+        ManifestError: an invalid name, or the file exists already.
         CaptureError: the folder is not a capture. Problems inside a capture are listed in its manifest instead.
     """
     path = Path(folder) / f"{name}.yaml"
@@ -147,8 +147,6 @@ def new_manifest(
         raise ManifestError(f"{name!r}: not a run name. Expected letters, digits, '-', '_', '.', such as my-place.")
     if path.exists():
         raise ManifestError(f"{path} exists already. Give another name, or remove it first.")
-    if not TEMPLATE.is_file():
-        raise ManifestError(f"{TEMPLATE}: no such file. Install the toolkit again.")
     head = [f"# {name}. `{COMMAND} settings` lists all other settings."]
     template = TEMPLATE.read_text(encoding="utf-8").splitlines()
     lines = list(dropwhile(lambda line: line.startswith("# "), template))  # its first comment explains how to copy it
@@ -162,10 +160,7 @@ def new_manifest(
         if thresholds:
             changed["  thresholds: "] = f"  thresholds: {[list(one) for one in thresholds]} # degrees, meters"
         for prefix, new_line in changed.items():
-            index = next((index for index, line in enumerate(lines) if line.startswith(prefix)), None)
-            if index is None:
-                raise ManifestError(f"{TEMPLATE}: no line starts with {prefix!r}. Restore the file.")
-            lines[index] = new_line
+            lines[next(index for index, line in enumerate(lines) if line.startswith(prefix))] = new_line
     write_text(path, "\n".join([*head, *lines]) + "\n")
     return path
 

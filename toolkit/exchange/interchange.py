@@ -341,6 +341,10 @@ def camera_at(where: object, params: str) -> pycolmap.Camera:
         raise CaptureError(f"{where}: {error}") from None
 
 
+def _camera_in(row: Mapping[Any, Any], where: str) -> pycolmap.Camera:
+    return camera_at(where, ", ".join([row["model"], row["width"], row["height"], *str(row["params"]).split()]))
+
+
 def _map_cameras(draft: Draft, device: str) -> MapCameras | None:
     """Return the cameras of the map that queries are imported beside; None if there is no map, or none to be read."""
     session = draft.session.with_name(f"{device}_map")
@@ -353,7 +357,7 @@ def _map_cameras(draft: Draft, device: str) -> MapCameras | None:
 
 def _camera_of(
     row: Mapping[Any, Any], by_id: Mapping[str, pycolmap.Camera | str], shared: pycolmap.Camera | None, path: Path,
-    where: str, of_map: MapCameras | None = None,
+    where: str, of_map: MapCameras | None,
 ) -> tuple[pycolmap.Camera | str, str]:  # fmt: skip
     """Return the camera of an image and its origin: the table, cameras.txt, the camera shared by all images, or that of
     `known_camera`.
@@ -361,8 +365,7 @@ def _camera_of(
     The camera may be why it cannot be used. `where` names file and line of the image's row, for messages.
     """
     if "model" in row:
-        text = ", ".join([row["model"], row["width"], row["height"], *str(row["params"]).split()])
-        return camera_at(where, text), "given by the table"
+        return _camera_in(row, where), "given by the table"
     if "camera_id" in row:
         if row["camera_id"] not in by_id:
             ids = ", ".join(by_id) or "none: give cameras.txt"
@@ -422,12 +425,8 @@ def read_intrinsics(table: Path) -> dict[str, pycolmap.Camera]:
     rows = _read_table(table)
     if "model" not in rows:
         raise CaptureError(f"{table}: no intrinsics in it. Expected the columns image, {', '.join(_CAMERA_COLUMNS)}.")
-    found = {}
-    for row in rows.to_dict("records"):
-        camera, _ = _camera_of(row, {}, None, table, f"{table}, line {row['line']}")
-        assert isinstance(camera, pycolmap.Camera)
-        found[str(row["image"])] = camera
-    return found
+    records = rows.to_dict("records")
+    return {str(row["image"]): _camera_in(row, f"{table}, line {row['line']}") for row in records}
 
 
 def _read_table(path: Path) -> pd.DataFrame:
@@ -600,7 +599,6 @@ def _read_transforms(path: Path) -> dict[str, Any]:
     if not isinstance(frames, list) or not any(isinstance(frame, dict) for frame in frames):
         found = f"keys {', '.join(map(repr, content))[:100]}" if isinstance(content, dict) else repr(content)[:100]
         raise CaptureError(f"{path}: frames: found {found or 'nothing'}, no list of frames. {expected}")
-    assert isinstance(content, dict)
     return content
 
 

@@ -17,8 +17,8 @@ from tqdm.auto import tqdm
 from toolkit.capture.images import (
     HEADER_ERRORS,
     HEIC_HOW,
+    camera_from_exif,
     camera_text,
-    exif_camera,
     exif_key,
     find_mask,
     heic_is_read,
@@ -232,15 +232,15 @@ def initial_cameras(
             key = prefix
         if key not in keys:
             keys[key] = len(cameras)
-            cameras.append(_initial(item.path, size) if given is None else pycolmap.Camera(given.todict()))
+            cameras.append(_initial(size, item.exif) if given is None else pycolmap.Camera(given.todict()))
         numbers.append(keys[key])
     return numbers, cameras
 
 
-def _initial(path: Path, size: tuple[int, int]) -> pycolmap.Camera:
+def _initial(size: tuple[int, int], exif: Mapping[int, Any]) -> pycolmap.Camera:
     width, height = size
     try:
-        focal_px, known = exif_camera(path).camera.mean_focal_length(), True
+        focal_px, known = camera_from_exif(size, exif).camera.mean_focal_length(), True
     except ImageError:
         focal_px, known = FOCAL_PRIOR * max(size), False
     params = [focal_px, width / 2, height / 2, 0.0]

@@ -12,9 +12,7 @@ from toolkit.manifest.manifest import (
 )
 from toolkit.manifest.settings import (
     AUTO,
-    AlikedModel,
     AlikedSettings,
-    Checkpoint,
     EmbedSettings,
     EvaluateSettings,
     ExploreSettings,

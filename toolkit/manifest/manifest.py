@@ -389,14 +389,13 @@ def _read_yaml(path: Path, heir: Path | None = None) -> dict[str, Any]:
 
 def _parse_yaml(text: str) -> Any:
     """Return the content of a YAML text; raise yaml.YAMLError for an invalid one, or aliases that expand too far."""
-    loader = yaml.SafeLoader(text)
+    loader = _Loader(text)
     try:
         node = loader.get_single_node()
         if node is None:
             return None
         if _size(node, {}) > MAX_VALUES:
             raise yaml.YAMLError(f"Its aliases expand to more than {MAX_VALUES:,} values.")
-        _require_single_keys(node, set())
         return loader.construct_document(node)
     except RecursionError:
         raise yaml.YAMLError("It is nested too deeply, or an alias contains itself.") from None
@@ -404,22 +403,17 @@ def _parse_yaml(text: str) -> Any:
         raise yaml.YAMLError(f"A value does not fit its type ({error}).") from None
 
 
-def _require_single_keys(node: yaml.Node, seen: set[int]) -> None:
-    """Raise YAMLError if a mapping has a key twice: PyYAML silently takes the last."""
-    if id(node) in seen or not isinstance(node, yaml.CollectionNode):
-        return
-    seen.add(id(node))
-    if isinstance(node, yaml.MappingNode):
-        first: dict[tuple[str, str], yaml.Node] = {}
-        for key, value in node.value:
+class _Loader(yaml.SafeLoader):
+    """Raises YAMLError if a mapping has a key twice: PyYAML silently takes the last."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        node, first = super().compose_mapping_node(anchor), dict[tuple[str, str], yaml.Node]()
+        for key, _ in node.value:
             plain = isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge"
             if plain and (other := first.setdefault((key.tag, key.value), key)) is not key:
                 found = f"The key {key.value!r} is there twice, first in line {other.start_mark.line + 1}"
                 raise yaml.MarkedYAMLError(problem=f"{found}; keep one of them", problem_mark=key.start_mark)
-            _require_single_keys(value, seen)
-    else:
-        for value in node.value:
-            _require_single_keys(value, seen)
+        return node
 
 
 def _size(node: yaml.Node, sizes: dict[int, int]) -> int:

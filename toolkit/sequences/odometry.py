@@ -65,9 +65,7 @@ class Odometry:
 
     def scaled(self, factor: float) -> "Odometry":
         """Return the odometry with all translations multiplied by a factor."""
-        poses = self.odom_from_rig.copy()
-        poses[:, :3, 3] *= factor
-        return replace(self, odom_from_rig=poses)
+        return replace(self, odom_from_rig=geometry.scaled(self.odom_from_rig, factor))
 
     def drift(self, settings: SequenceSettings, first: Ints, second: Ints) -> tuple[Floats, Floats]:
         """Return standard deviations (n,) by axis of the relative poses of n pairs of frames: radians, meters."""
@@ -140,7 +138,7 @@ def recordings_of(session: Session, odometry: Trajectory) -> dict[str, Ints]:
     A recording is a subsession, or one device if several devices move in the subsession. Of several poses of a device
     at the same time, the first counts.
     """
-    subsessions, recordings = subsessions_of(session, odometry.device_ids), dict[str, Ints]()
+    subsessions, recordings = session.subsession_by_prefix(odometry.arrow_ids), dict[str, Ints]()
     names, times = device_names(odometry.timestamps, odometry.device_ids), odometry.timestamps
     repeated = pd.DataFrame({"device": names, "timestamp": times}).duplicated().to_numpy()
     for name in dict.fromkeys(subsessions.tolist()):
@@ -158,14 +156,6 @@ def device_names(timestamps: Ints, device_ids: NDArray[np.object_]) -> NDArray[n
     """Return device names (N,) that do not change with time: some ids of rigs and sensors contain the timestamp."""
     pairs = zip(device_ids.tolist(), timestamps.tolist(), strict=True)
     return np.array([device.replace(str(time), "") for device, time in pairs], object)
-
-
-def subsessions_of(session: Session, device_ids: NDArray[np.object_]) -> NDArray[np.object_]:
-    """Return the subsession (N,) of each device, "" for none."""
-    subsessions = np.full(len(device_ids), "", object)
-    for name in sorted(session.subsessions, key=len):
-        subsessions[[device.startswith(f"{name}/") for device in device_ids]] = name
-    return subsessions
 
 
 @dataclass(frozen=True)
