@@ -126,9 +126,7 @@ def test_an_image_without_a_rotation_is_a_row(q: str, tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("points", ["\n", ""])
-def test_a_line_that_is_neither_image_nor_points_is_refused(
-    line: int, text: str, points: str, tmp_path: Path
-) -> None:
+def test_a_line_that_is_neither_image_nor_points_is_refused(line: int, text: str, points: str, tmp_path: Path) -> None:
     lines = images_txt().split("\n")
     lines[line - 1] = text
     content = "\n".join(lines) if points else "\n".join(filter(None, lines))
@@ -219,13 +217,11 @@ def test_a_binary_file_of_any_other_length_is_refused(tmp_path: Path) -> None:
     for name in ("cameras", "images", "rigs", "frames"):
         path = whole / f"{name}.bin"
         data = path.read_bytes()
-        for damaged in [data[:size] for size in range(0, len(data), 3)] + [data[:-1], data + b"\0"]:
+        more = [data[:-1], data + b"\0", struct.pack("<Q", 2**60) + data[8:]]
+        for damaged in [data[:size] for size in range(0, len(data), 3)] + more:
             path.write_bytes(damaged)
             with pytest.raises(CaptureError, match=name):
                 read_model(whole)
-        path.write_bytes(struct.pack("<Q", 2**60) + data[8:])
-        with pytest.raises(CaptureError, match=name):
-            read_model(whole)
         path.write_bytes(data)
 
 
@@ -271,10 +267,12 @@ def test_the_folder_of_models(tmp_path: Path) -> None:
         assert_read(folder)
         assert any("sparse/0" in note for note in read_model(folder).notes)
     write(tmp_path / "sparse" / "1", f"1 {qt(1)} 1 a.jpg")
-    with pytest.raises(CaptureError, match=r"0 \(6 images\), sparse/1 \(1 images\)"):
-        read_model(tmp_path)
-    with pytest.raises(CaptureError, match=r"expected a COLMAP model"):
-        read_model(Path(__file__).parent)
+    for folder, named in (
+        (tmp_path, r"0 \(6 images\), sparse/1 \(1 images\)"),
+        (Path(__file__).parent, "expected a COLMAP model"),
+    ):
+        with pytest.raises(CaptureError, match=named):
+            read_model(folder)
 
 
 @pytest.mark.parametrize("by", ["positions", "gps"])
