@@ -145,22 +145,15 @@ def test_a_table_has_a_column_of_times(tmp_path: Path) -> None:
     assert report.record["timestamps"] == [2, "as given"]
 
 
+SCALES = (1, 1e3, 1e6, 1e9)
+ASKED = "timestamps: found times such as .* Give --timestamps-unit"
+
+
 @pytest.mark.parametrize(
     ("given", "unit", "named"),
     [
-        *(
-            (
-                {"timestamps": [f"{scale * k / 10} rgb/{k}.png" for k in range(3)]},
-                None,
-                "timestamps: found times such as .* Give --timestamps-unit",
-            )
-            for scale in (1, 1e3, 1e6, 1e9)
-        ),
-        (
-            {"table": ["image,timestamp", "0.png,0.25", "1.png,0.75"]},
-            None,
-            "table: found times such as 0.5. Give --timestamps-unit",
-        ),
+        *(({"timestamps": [f"{scale * k / 10} rgb/{k}.png" for k in range(3)]}, None, ASKED) for scale in SCALES),
+        ({"table": ["image,timestamp", "0.png,0.25", "1.png,0.75"]}, None, "table: found times such as 0.5. Give"),
         ({"timestamps": ["0,0.png", "33,1.png"]}, "hours", "timestamps-unit: found 'hours'"),
     ],
 )
