@@ -200,13 +200,17 @@ def test_the_fingerprint_tells_weights_and_settings_apart(extractor: SuperPointE
     assert planted(max_keypoints=9).settings != planted("bfloat16", max_keypoints=9).settings != planted().settings
 
 
-def test_wrong_settings() -> None:
-    with pytest.raises(ManifestError, match=r"'max_keypoint'.*max_keypoints"):
-        planted(max_keypoint=3)
-    with pytest.raises(ManifestError, match="max_keypoints"):
-        planted(max_keypoints=0)
-    with pytest.raises(ManifestError, match="dtype_compute is 'float8'"):
-        planted("float8")
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"max_keypoint": 3}, "'max_keypoint'.*max_keypoints"),
+        ({"max_keypoints": 0}, "max_keypoints"),
+        ({"dtype": "float8"}, "dtype_compute is 'float8'"),
+    ],
+)
+def test_wrong_settings(wrong: dict[str, Any], named: str) -> None:
+    with pytest.raises(ManifestError, match=named):
+        planted(**wrong)
 
 
 @pytest.mark.parametrize("image", [np.zeros((8, 8)), np.zeros((8, 8, 4), np.uint8), np.zeros((0, 8), np.uint8)])
