@@ -343,14 +343,14 @@ def test_missing_and_torn_files_are_rows_not_exceptions(scene):
 
 
 def test_unknown_choices_are_named(scene):
-    with pytest.raises(ToolkitError, match=r"'spot'.*ios, hl"):
-        evaluate_scene(*scene, None, map_device="spot")
-    with pytest.raises(ToolkitError, match="device, camera"):
-        evaluate_ios(scene, at="rig")
-    with pytest.raises(ToolkitError, match=r"\[\['ios', 'spto'\]\]"):
-        evaluate_scene(*scene, None, pairs=[["ios", "spto"]])
-    with pytest.raises(ToolkitError, match="thresholds"):
-        evaluate_scene(*scene, None, {"thresholds": []})
+    for wrong, named in (
+        (lambda: evaluate_scene(*scene, None, map_device="spot"), "'spot'.*ios, hl"),
+        (lambda: evaluate_ios(scene, at="rig"), "device, camera"),
+        (lambda: evaluate_scene(*scene, None, pairs=[["ios", "spto"]]), r"\[\['ios', 'spto'\]\]"),
+        (lambda: evaluate_scene(*scene, None, {"thresholds": []}), "thresholds"),
+    ):
+        with pytest.raises(ToolkitError, match=named):
+            wrong()
 
 
 def test_only_the_pairs_asked_for_are_evaluated(scene):

@@ -1,5 +1,8 @@
 """Poses on arrays: round trips, known answers, and the rotations where formulas break."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -57,17 +60,20 @@ def test_rotation_angle(angle_deg: float) -> None:
     assert geometry.rotation_angle_deg(R.T) == pytest.approx(angle_deg, rel=1e-9, abs=1e-14)
 
 
-@pytest.mark.parametrize("bad", [[0, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 1], [[1, 0, 0, 0], [0, 0, 0, 0]]])
-def test_quaternions_that_are_no_rotation_are_refused(bad: list) -> None:
-    with pytest.raises(ValueError, match="quaternion"):
-        geometry.quaternion_to_rotation(bad)
-
-
-def test_wrong_shapes_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"\(\.\.\., 4\)"):
-        geometry.quaternion_to_rotation([1, 0, 0])
-    with pytest.raises(ValueError, match=r"\(\.\.\., 3, 3\)"):
-        geometry.rotation_to_quaternion(np.eye(4))
+@pytest.mark.parametrize(
+    ("convert", "bad", "named"),
+    [
+        (geometry.quaternion_to_rotation, [0, 0, 0, 0], "quaternion"),
+        (geometry.quaternion_to_rotation, [np.nan, 0, 0, 1], "quaternion"),
+        (geometry.quaternion_to_rotation, [np.inf, 0, 0, 1], "quaternion"),
+        (geometry.quaternion_to_rotation, [[1, 0, 0, 0], [0, 0, 0, 0]], "quaternion"),
+        (geometry.quaternion_to_rotation, [1, 0, 0], r"\(\.\.\., 4\)"),
+        (geometry.rotation_to_quaternion, np.eye(4), r"\(\.\.\., 3, 3\)"),
+    ],
+)
+def test_what_is_no_rotation_is_refused(convert: Callable[[Any], object], bad: Any, named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        convert(bad)
 
 
 def test_pose_rows_round_trip_in_any_number_of_dimensions() -> None:

@@ -42,10 +42,10 @@ def test_a_manifest_of_the_toolkit_is_found_by_its_name_from_any_folder(
     assert load_manifest(find_manifest("demo")).description == "mine", "a user's own comes first"
     Path("other.yaml").write_text("description: beside\n")
     assert find_manifest("other.yaml") == Path("other.yaml")
-    with pytest.raises(ManifestError, match=r"dmeo: .*Did you mean 'demo'"):
-        find_manifest("dmeo")
-    with pytest.raises(ManifestError, match=r"gone.*demo\.yaml"):  # a folder is named: this very file is meant
-        load_manifest(find_manifest("gone/demo.yaml"))
+    # Where a folder is named, this very file is meant.
+    for name, named in (("dmeo", "dmeo: .*Did you mean 'demo'"), ("gone/demo.yaml", r"gone.*demo\.yaml")):
+        with pytest.raises(ManifestError, match=named):
+            load_manifest(find_manifest(name))
 
 
 def test_one_branch_of_the_settings_is_shown(capsys: pytest.CaptureFixture[str]) -> None:

@@ -87,10 +87,9 @@ def test_without_truth_the_weakest_are_shown_not_the_strongest(small_capture, dr
 
 def test_only_the_pairs_asked_for_and_none_without_poses(small_capture, drawn, tmp_path):
     capture = Capture.open(small_capture)
-    with pytest.raises(ArtifactError, match="Localize"):
-        visualize_scene(small_capture / "sessions", tmp_path, None, tmp_path / "out", QUICK)
-    with pytest.raises(CaptureError, match="drone"):
-        visualize_scene(small_capture / "sessions", tmp_path, None, tmp_path / "out", QUICK, map_device="drone")
+    for device, error, named in (("all", ArtifactError, "Localize"), ("drone", CaptureError, "drone")):
+        with pytest.raises(error, match=named):
+            visualize_scene(small_capture / "sessions", tmp_path, None, tmp_path / "out", QUICK, map_device=device)
     for device in ("ios", "hl"):
         write_pair(capture, tmp_path, "ios", device, queries_of(capture, device, 1))
     pairs = [["ios", "hl"], ["hl", "hl"]]
