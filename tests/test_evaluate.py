@@ -399,5 +399,5 @@ def test_an_unusable_session_or_pair_is_a_row_with_the_reason(scene, tmp_path):
     reasons = result.pairs.set_index(["map_device", "query_device"])["reason"]
     assert reasons["ios", "ios"] == ""
     assert reasons["hl", "ios"] == "a dragon"
-    with pytest.raises(CaptureError, match="line 1"):
+    with pytest.raises(CaptureError):
         evaluate_scene(sessions, poses, references, None, query_device="hl")

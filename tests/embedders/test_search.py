@@ -147,7 +147,7 @@ def test_an_index_is_of_its_embeddings(place: Path, tmp_path: Path) -> None:
     assert load_index(tmp_path / "embeddings", "ios_map", vectors, settings) is not None
     matrix = np.load(vectors.parts[""].paths[1])
     np.save(vectors.parts[""].paths[1], matrix[::-1])
-    with pytest.raises(ArtifactError, match="from other embeddings"):
+    with pytest.raises(ArtifactError):
         load_index(tmp_path / "embeddings", "ios_map", vectors, settings)
 
 

@@ -212,6 +212,7 @@ def test_edited_images_beside_frames_are_said(tmp_path: Path, photos: Path) -> N
 
 
 def test_a_binary_file_of_any_other_length_is_refused(tmp_path: Path) -> None:
+    """COLMAP read on beyond its end, and a camera of a rig moved by 0.7 m."""
     whole = binary(rig_model(tmp_path / "model"), tmp_path / "bin")
     assert len(read_model(whole).images) == 4
     for name in ("cameras", "images", "rigs", "frames"):
@@ -220,7 +221,7 @@ def test_a_binary_file_of_any_other_length_is_refused(tmp_path: Path) -> None:
         more = [data[:-1], data + b"\0", struct.pack("<Q", 2**60) + data[8:]]
         for damaged in [data[:size] for size in range(0, len(data), 3)] + more:
             path.write_bytes(damaged)
-            with pytest.raises(CaptureError, match=name):
+            with pytest.raises(CaptureError, match=rf"{name}\.bin: {'cut short' if len(damaged) < len(data) else ''}"):
                 read_model(whole)
         path.write_bytes(data)
 

@@ -110,7 +110,7 @@ def test_the_axes_may_be_those_of_opencv_and_the_unit_not_the_meter(tmp_path: Pa
     np.testing.assert_allclose(opencv.world_from_cam()[1][:3, :3], np.array(matrix(1))[:3, :3], rtol=0, atol=1e-12)
     np.testing.assert_allclose(opencv.world_from_cam()[:, :3, 3], opengl[:, :3, 3] / 100, rtol=0, atol=1e-12)
     for options in ({"axes": "arkit"}, {"unit_m": 0.0}, {"split": "train"}, {"hold_out": 1}, {"hold_out": 4}):
-        with pytest.raises(ManifestError, match=r"Known|expected|Give"):
+        with pytest.raises(ManifestError):
             import_transforms(file, tmp_path / "C", **options)  # type: ignore[arg-type]
     assert not (tmp_path / "C").exists()
 

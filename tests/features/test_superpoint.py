@@ -1,6 +1,5 @@
 """SuperPoint: where keypoints lie, that batches change nothing, and what is refused. Weights are random or made up."""
 
-import sys
 from typing import Any
 
 import numpy as np
@@ -9,9 +8,9 @@ import torch
 from numpy.typing import NDArray
 
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
-from toolkit.features.features import LocalFeatures, create_extractor
+from toolkit.features.features import LocalFeatures
 from toolkit.features.network import SuperPointExtractor
-from toolkit.manifest import FeaturesSettings, SuperPointSettings
+from toolkit.manifest import SuperPointSettings
 
 transformers = pytest.importorskip("transformers", reason="needs the extra `learned`")
 
@@ -238,9 +237,3 @@ def test_other_weights() -> None:
     assert "1 missing: encoder.conv_blocks.0.conv_a.bias" in message
     assert "1 unexpected: extra" in message
     assert "keypoint_decoder.conv_score_b.bias found (64,)" in message
-
-
-def test_without_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(ToolkitError, match=r"transformers cannot be imported .* pip install 'transformers"):
-        create_extractor("superpoint", FeaturesSettings())

@@ -141,7 +141,7 @@ def test_a_query_is_found_by_number_key_and_image(tmp_path: Path) -> None:
         assert [one.images for one in found] == [QUERIES[key].images] * 3
         assert results[f"b/{number}.jpg"].references == QUERIES[key].references
     for unknown in ((7, "nobody"), "c.jpg", len(keys)):
-        with pytest.raises(ArtifactError, match=r"no query|expected a number"):
+        with pytest.raises(ArtifactError):
             results[unknown]
 
 

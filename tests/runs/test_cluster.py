@@ -254,13 +254,6 @@ def test_local_workers_use_the_gpus_that_are_visible(
     assert [one["options"]["env"].get("CUDA_VISIBLE_DEVICES") for one in workers.values()] == given
 
 
-def test_without_dask_one_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    said = r"distributed cannot .* pip install .*dask-jobqueue"
-    with pytest.raises(ManifestError, match=said), open_cluster("local"):
-        pass
-
-
 @pytest.mark.parametrize(
     ("content", "said"),
     [(None, "cannot be read"), ("queue: x", "jobs: <number>"), ("- 1", "jobs: <number>"), ("a: [", "cannot be read"),
