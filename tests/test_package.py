@@ -55,14 +55,11 @@ def test_a_manifest_of_the_toolkit_is_found_by_its_name_from_any_folder(
             load_manifest(find_manifest(name))
 
 
-@pytest.mark.parametrize(
-    ("package", "ask", "installed"),
-    [
-        ("distributed", lambda: open_cluster("local").__enter__(), "dask-jobqueue"),
-        ("transformers", lambda: create_extractor("superpoint", FeaturesSettings()), "'transformers"),
-        ("gtsam", lambda: place_piece(WAY.odometry, WAY.queries, SequenceSettings()), "gtsam"),
-    ],
-)
+@pytest.mark.parametrize(("package", "ask", "installed"), [
+    ("distributed", lambda: open_cluster("local").__enter__(), "dask-jobqueue"),
+    ("transformers", lambda: create_extractor("superpoint", FeaturesSettings()), "'transformers"),
+    ("gtsam", lambda: place_piece(WAY.odometry, WAY.queries, SequenceSettings()), "gtsam"),
+])  # fmt: skip
 def test_without_an_extra_one_sentence_says_what_to_install(
     package: str, ask: Callable[[], object], installed: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -346,16 +346,13 @@ def test_parameters_must_be_literals(tmp_path: Path) -> None:
         notebook.notebook_parameters(tmp_path / "02_embed.ipynb")
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "expected"),
-    [
-        ({"only": "embedd"}, ManifestError, "embed"),
-        ({"overrides": ["captures=[Q]"]}, CaptureError, "Q"),
-        ({"overrides": ["devices=[spot]"]}, ManifestError, "devices"),
-        ({"overrides": ["embed.model=megalok"]}, ManifestError, "megalok.*megaloc"),
-        ({"overrides": ["output_root=run.yaml/runs"]}, ManifestError, r"output_root: .*run\.yaml/runs"),
-    ],
-)
+@pytest.mark.parametrize(("options", "error", "expected"), [
+    ({"only": "embedd"}, ManifestError, "embed"),
+    ({"overrides": ["captures=[Q]"]}, CaptureError, "Q"),
+    ({"overrides": ["devices=[spot]"]}, ManifestError, "devices"),
+    ({"overrides": ["embed.model=megalok"]}, ManifestError, "megalok.*megaloc"),
+    ({"overrides": ["output_root=run.yaml/runs"]}, ManifestError, r"output_root: .*run\.yaml/runs"),
+])  # fmt: skip
 def test_what_cannot_run_is_refused(
     place: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, object], error: type[Exception], expected: str
 ) -> None:

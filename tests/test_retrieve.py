@@ -287,16 +287,13 @@ def test_vectors_of_two_vocabularies_are_not_compared(tiny: Path, tmp_path: Path
         load_embeddings(tmp_path / "embeddings/hl_map")
 
 
-@pytest.mark.parametrize(
-    ("folder", "options", "error", "named"),
-    [
-        ("nowhere", {}, ArtifactError, "--only embed"),
-        ("embeddings", {"map_device": "spot"}, CaptureError, "'spot'.*ios, hl"),
-        ("embeddings", {"queries": "nope"}, CaptureError, "pruned_subsampled"),
-        ("embeddings", {"out_jsonl": "one.jsonl"}, ManifestError, r"one\.jsonl"),
-        ("embeddings", {"settings": {"topk": 0}}, ManifestError, "topk"),
-    ],
-)
+@pytest.mark.parametrize(("folder", "options", "error", "named"), [
+    ("nowhere", {}, ArtifactError, "--only embed"),
+    ("embeddings", {"map_device": "spot"}, CaptureError, "'spot'.*ios, hl"),
+    ("embeddings", {"queries": "nope"}, CaptureError, "pruned_subsampled"),
+    ("embeddings", {"out_jsonl": "one.jsonl"}, ManifestError, r"one\.jsonl"),
+    ("embeddings", {"settings": {"topk": 0}}, ManifestError, "topk"),
+])  # fmt: skip
 def test_refused(
     tiny: Path, tmp_path: Path, folder: str, options: dict[str, Any], error: type[Exception], named: str
 ) -> None:

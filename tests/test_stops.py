@@ -448,15 +448,12 @@ def test_a_notebook_that_is_no_stage_looks_at_its_parameters(
 INJECTED = {"In": ["", "topk = 10  # a user's cell", "# Parameters\ntop_k = 5\n"]}  # by papermill
 
 
-@pytest.mark.parametrize(
-    ("stage", "asked", "error", "message"),
-    [
-        ("localize", {"map_device": "all", "query_device": "oss"}, CaptureError, "device 'oss'.*: ios"),
-        ("localize", {"queries": "keyframes_evry"}, CaptureError, "'keyframes_evry'.*every"),
-        ("retrieve", {"topk": "ten"}, ManifestError, "topk"),
-        ("retrieve", INJECTED, ManifestError, r"top_k: 03_retrieve\.ipynb .*topk"),
-    ],
-)
+@pytest.mark.parametrize(("stage", "asked", "error", "message"), [
+    ("localize", {"map_device": "all", "query_device": "oss"}, CaptureError, "device 'oss'.*: ios"),
+    ("localize", {"queries": "keyframes_evry"}, CaptureError, "'keyframes_evry'.*every"),
+    ("retrieve", {"topk": "ten"}, ManifestError, "topk"),
+    ("retrieve", INJECTED, ManifestError, r"top_k: 03_retrieve\.ipynb .*topk"),
+])  # fmt: skip
 def test_a_notebook_looks_for_what_it_is_asked_before_earlier_stages_are_made(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

@@ -514,18 +514,15 @@ def test_capture_opens_sessions_lazily(tmp_path: Path) -> None:
             capture[name]
 
 
-@pytest.mark.parametrize(
-    ("open_folder", "made", "asked", "named"),
-    [
-        (Capture.open, "", "none", "capture folder"),
-        (Capture.open, "", "", "sessions"),
-        (Capture.open, "sessions", "", "sessions"),
-        (check_capture, "", "", "has no folder `sessions`"),
-        (Capture.from_sessions_root, "sessions", "", "is not the `sessions` folder"),
-        (Session.open, "", "ios_map", "ios_map"),
-        (Session.open, "ios_map", "ios_map", r"sensors.txt: "),
-    ],
-)
+@pytest.mark.parametrize(("open_folder", "made", "asked", "named"), [
+    (Capture.open, "", "none", "capture folder"),
+    (Capture.open, "", "", "sessions"),
+    (Capture.open, "sessions", "", "sessions"),
+    (check_capture, "", "", "has no folder `sessions`"),
+    (Capture.from_sessions_root, "sessions", "", "is not the `sessions` folder"),
+    (Session.open, "", "ios_map", "ios_map"),
+    (Session.open, "ios_map", "ios_map", r"sensors.txt: "),
+])  # fmt: skip
 def test_what_is_no_capture_is_refused(
     open_folder: Callable[[Path], object], made: str, asked: str, named: str, tmp_path: Path
 ) -> None:
@@ -600,13 +597,10 @@ def test_a_session_without_access_leaves_the_others(
     assert "Permission denied" in problems[0].message
 
 
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
-        ("EQUIRECTANGULAR, 2048, 1024, 2048, 1024", "EQUIRECTANGULAR"),
-        ("PINHOLE, 640, 480, 0, 500, 320, 240", "focal length"),
-    ],
-)
+@pytest.mark.parametrize(("text", "named"), [
+    ("EQUIRECTANGULAR, 2048, 1024, 2048, 1024", "EQUIRECTANGULAR"),
+    ("PINHOLE, 640, 480, 0, 500, 320, 240", "focal length"),
+])  # fmt: skip
 def test_a_panorama_and_a_focal_length_of_zero_are_no_camera(text: str, named: str) -> None:
     with pytest.raises(ValueError, match=named):
         parse_camera("camera", text)

@@ -97,17 +97,14 @@ def noise_file(path: Path) -> bytes:
     return path.read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("suffix", "cut", "min_side"),
-    [
-        *(("jpg", lambda whole, other=other: other, None)
-          for other in (b"", b"\xff\xd8", b"\xff\xd8\xff\xe0" + b"junk" * 50, b"<html>404</html>")),
-        ("jpg", lambda whole: whole[:300], None),
-        ("jpg", lambda whole: whole[: len(whole) // 2], 50),
-        *((suffix, lambda whole: whole[: len(whole) // 2], None) for suffix in ("jpg", "png")),
-        *((suffix, lambda whole: whole[:-20], None) for suffix in ("jpg", "png")),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("suffix", "cut", "min_side"), [
+    *(("jpg", lambda whole, other=other: other, None)
+      for other in (b"", b"\xff\xd8", b"\xff\xd8\xff\xe0" + b"junk" * 50, b"<html>404</html>")),
+    ("jpg", lambda whole: whole[:300], None),
+    ("jpg", lambda whole: whole[: len(whole) // 2], 50),
+    *((suffix, lambda whole: whole[: len(whole) // 2], None) for suffix in ("jpg", "png")),
+    *((suffix, lambda whole: whole[:-20], None) for suffix in ("jpg", "png")),
+])  # fmt: skip
 def test_what_is_no_image_or_cut_short_is_refused(
     tmp_path: Path, suffix: str, cut: Callable[[bytes], bytes], min_side: int | None
 ) -> None:

@@ -153,13 +153,10 @@ def test_names_too_long_for_files_are_refused(tmp_path: Path) -> None:
     assert "File name too long" in next(iter(store.failed.values()))
 
 
-@pytest.mark.parametrize(
-    ("kind", "name"),
-    [
-        *(("capture", name) for name in (".hidden", "line\nbreak", "\u202egnp", "x" * 101, "\udcff")),
-        *(("session", name) for name in (".ios_map", "a\tb_map", "x" * 41 + "_map")),
-    ],
-)
+@pytest.mark.parametrize(("kind", "name"), [
+    *(("capture", name) for name in (".hidden", "line\nbreak", "\u202egnp", "x" * 101, "\udcff")),
+    *(("session", name) for name in (".ios_map", "a\tb_map", "x" * 41 + "_map")),
+])  # fmt: skip
 def test_the_folder_of_a_capture_and_of_a_session_has_a_name(tmp_path: Path, kind: str, name: str) -> None:
     folder = session_of(tmp_path)
     if kind == "session":

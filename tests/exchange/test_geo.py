@@ -176,15 +176,12 @@ def test_what_is_refused(localized: Path, small_capture: Path, placed: Path, tmp
         (placed / "sessions/ios_map/proc/import.json").write_text(json.dumps({"origin": found}))
         origin_of(Capture.open(placed)["ios_map"])
 
+    beyond = {"latitude_deg": 99, "longitude_deg": 1, "altitude_m": 1}
     for wrong, error, named in (
         (lambda: geo_table(localized, small_capture), CaptureError, "no origin"),
         (lambda: export_geo(localized, tmp_path / "q.kml", placed), ManifestError, "geojson"),
         (lambda: origin([1, 2, 3]), CaptureError, r"import\.json: origin"),
-        (
-            lambda: origin({"latitude_deg": 99, "longitude_deg": 1, "altitude_m": 1}),
-            CaptureError,
-            r"import\.json: origin",
-        ),
+        (lambda: origin(beyond), CaptureError, r"import\.json: origin"),
         (lambda: origin({"latitude_deg": 1}), CaptureError, r"import\.json: origin"),
     ):
         with pytest.raises(error, match=named):

@@ -169,16 +169,13 @@ def test_a_file_of_hloc_is_read(tmp_path: Path) -> None:
 OTHER = {"numbers": np.zeros(3), "a/b/matches0": np.zeros((3, 2), int)}
 
 
-@pytest.mark.parametrize(
-    ("content", "pair", "named"),
-    [
-        (None, None, r"other\.h5 cannot be read"),
-        (OTHER, None, "no local features"),
-        (OTHER, ("a", "b"), "not in the layout of hloc"),
-        (OTHER, ("a", "c"), "no matches of a and c"),
-        ({"a/keypoints": np.zeros((3, 2))}, None, "a is not in the layout of hloc"),
-    ],
-)
+@pytest.mark.parametrize(("content", "pair", "named"), [
+    (None, None, r"other\.h5 cannot be read"),
+    (OTHER, None, "no local features"),
+    (OTHER, ("a", "b"), "not in the layout of hloc"),
+    (OTHER, ("a", "c"), "no matches of a and c"),
+    ({"a/keypoints": np.zeros((3, 2))}, None, "a is not in the layout of hloc"),
+])  # fmt: skip
 def test_what_is_no_file_of_hloc_is_refused_by_name(
     content: dict[str, np.ndarray] | None, pair: tuple[str, str] | None, named: str, tmp_path: Path
 ) -> None:

@@ -741,43 +741,30 @@ def test_images_txt_of_colmap_says_how_it_is_imported(folder: Path, tmp_path: Pa
         import_images(folder, tmp_path / "PLACE", split="map", table=table)
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "named"),
-    [
-        ({"split": "train"}, ManifestError, "Known: "),
-        ({"placing": "move"}, ManifestError, "Known: "),
-        ({"poses_are": "cam_to_world"}, ManifestError, "Known: "),
-        *(({"device": device}, ManifestError, "device: ") for device in ("../drone", "", "my drone", "a/b")),
-        ({"device": "a" * 60}, ManifestError, "40 bytes"),
-        ({"axes": "openGL"}, ManifestError, r"axes: unknown 'openGL'. Did you mean 'opengl'"),
-        ({"unit_m": -1}, ManifestError, "unit: found -1, expected the meters"),
-        ({"split": "map", "table": POSES, "hold_out": 4}, ManifestError, "hold-out: found 4, but there are 3"),
-        ({"split": "map", "table": POSES, "truth": POSES}, ManifestError, r"truth: .* the images of a map"),
-        ({"table": POSES, "truth": POSES}, ManifestError, r"truth: .* whose table has poses"),
-        (
-            {"truth": f"{POSED}2.jpg,1,0,0,0,0,0,0\n"},
-            CaptureError,
-            r"truth: no row .* '2\.jpg' and others, expected 'a/10\.png'",
-        ),
-        ({"truth": "image\na/2.jpg\n"}, CaptureError, "truth: no poses"),
-        ({"only": ["*.jpeg"]}, CaptureError, "none of 3 images fits"),
-        ({"cameras": TWO_CAMERAS}, CaptureError, r"has 2 different cameras; .* --camera 'PINHOLE, 64, 48, 50\.0, 51"),
-        (
-            {"cameras": TWO_CAMERAS, "table": "image,camera_id\na/2.jpg,9\n"},
-            CaptureError,
-            r"table, line 2: camera_id '9' .*3, 8",
-        ),
-        ({"cameras": "1 PINHOLE 64 48 x 51 32 24\n"}, CaptureError, "cameras, line 1: "),
-        (
-            {"table": "image,model,width,height,params\n\na/2.jpg,PINHOLE,64,48,50 51 32\n"},
-            CaptureError,
-            "table, line 3: ",
-        ),
-        ({"images": "nowhere"}, CaptureError, "nowhere: "),
-        ({"images": "empty"}, CaptureError, "empty: "),
-        ({"capture": "DONE"}, CaptureError, "ios_query"),
-    ],
-)
+@pytest.mark.parametrize(("options", "error", "named"), [
+    ({"split": "train"}, ManifestError, "Known: "),
+    ({"placing": "move"}, ManifestError, "Known: "),
+    ({"poses_are": "cam_to_world"}, ManifestError, "Known: "),
+    *(({"device": device}, ManifestError, "device: ") for device in ("../drone", "", "my drone", "a/b")),
+    ({"device": "a" * 60}, ManifestError, "40 bytes"),
+    ({"axes": "openGL"}, ManifestError, r"axes: unknown 'openGL'. Did you mean 'opengl'"),
+    ({"unit_m": -1}, ManifestError, "unit: found -1, expected the meters"),
+    ({"split": "map", "table": POSES, "hold_out": 4}, ManifestError, "hold-out: found 4, but there are 3"),
+    ({"split": "map", "table": POSES, "truth": POSES}, ManifestError, r"truth: .* the images of a map"),
+    ({"table": POSES, "truth": POSES}, ManifestError, r"truth: .* whose table has poses"),
+    ({"truth": f"{POSED}2.jpg,1,0,0,0,0,0,0\n"}, CaptureError,
+     r"truth: no row .* '2\.jpg' and others, expected 'a/10\.png'"),
+    ({"truth": "image\na/2.jpg\n"}, CaptureError, "truth: no poses"),
+    ({"only": ["*.jpeg"]}, CaptureError, "none of 3 images fits"),
+    ({"cameras": TWO_CAMERAS}, CaptureError, r"has 2 different cameras; .* --camera 'PINHOLE, 64, 48, 50\.0, 51"),
+    ({"cameras": TWO_CAMERAS, "table": "image,camera_id\na/2.jpg,9\n"}, CaptureError,
+     r"table, line 2: camera_id '9' .*3, 8"),
+    ({"cameras": "1 PINHOLE 64 48 x 51 32 24\n"}, CaptureError, "cameras, line 1: "),
+    ({"table": "image,model,width,height,params\n\na/2.jpg,PINHOLE,64,48,50 51 32\n"}, CaptureError, "table, line 3: "),
+    ({"images": "nowhere"}, CaptureError, "nowhere: "),
+    ({"images": "empty"}, CaptureError, "empty: "),
+    ({"capture": "DONE"}, CaptureError, "ios_query"),
+])  # fmt: skip
 def test_wrong_choices_are_named_and_nothing_is_overwritten(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict, error: type[Exception], named: str
 ) -> None:

@@ -169,17 +169,14 @@ def test_a_rig_of_folders(small_capture: Path, tmp_path: Path) -> None:
 CAMERA_TABLE = "image,model,width,height,params\nother.jpg,PINHOLE,64,48,50 50 32 24\n"
 
 
-@pytest.mark.parametrize(
-    ("content", "options", "error", "named"),
-    [
-        ("{", ["rig"], CaptureError, "COLMAP reads"),
-        ('[{"cameras": 3}]', ["rig"], CaptureError, "COLMAP reads"),
-        ('[{"cameras": [{"image_prefix": "a/", "ref_sensor": true}]}]', ["rig"], CaptureError, "two cameras"),
-        (None, ["rig"], CaptureError, "two cameras"),
-        (CAMERA_TABLE, ["table"], CaptureError, r"given.*other.jpg.*expected '000"),
-        (CAMERA_TABLE, ["poses_prior", "positions"], ManifestError, "poses-prior"),
-    ],
-)
+@pytest.mark.parametrize(("content", "options", "error", "named"), [
+    ("{", ["rig"], CaptureError, "COLMAP reads"),
+    ('[{"cameras": 3}]', ["rig"], CaptureError, "COLMAP reads"),
+    ('[{"cameras": [{"image_prefix": "a/", "ref_sensor": true}]}]', ["rig"], CaptureError, "two cameras"),
+    (None, ["rig"], CaptureError, "two cameras"),
+    (CAMERA_TABLE, ["table"], CaptureError, r"given.*other.jpg.*expected '000"),
+    (CAMERA_TABLE, ["poses_prior", "positions"], ManifestError, "poses-prior"),
+])  # fmt: skip
 def test_rigs_and_tables_of_other_photographs_are_refused(
     content: str | None, options: list[str], error: type[Exception], named: str, photographs: Path, tmp_path: Path
 ) -> None:

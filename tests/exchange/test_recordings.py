@@ -149,14 +149,11 @@ SCALES = (1, 1e3, 1e6, 1e9)
 ASKED = "timestamps: found times such as .* Give --timestamps-unit"
 
 
-@pytest.mark.parametrize(
-    ("given", "unit", "named"),
-    [
-        *(({"timestamps": [f"{scale * k / 10} rgb/{k}.png" for k in range(3)]}, None, ASKED) for scale in SCALES),
-        ({"table": ["image,timestamp", "0.png,0.25", "1.png,0.75"]}, None, "table: found times such as 0.5. Give"),
-        ({"timestamps": ["0,0.png", "33,1.png"]}, "hours", "timestamps-unit: found 'hours'"),
-    ],
-)
+@pytest.mark.parametrize(("given", "unit", "named"), [
+    *(({"timestamps": [f"{scale * k / 10} rgb/{k}.png" for k in range(3)]}, None, ASKED) for scale in SCALES),
+    ({"table": ["image,timestamp", "0.png,0.25", "1.png,0.75"]}, None, "table: found times such as 0.5. Give"),
+    ({"timestamps": ["0,0.png", "33,1.png"]}, "hours", "timestamps-unit: found 'hours'"),
+])  # fmt: skip
 def test_times_of_an_unknown_unit_are_refused(
     given: dict[str, list[str]], unit: str | None, named: str, tmp_path: Path
 ) -> None:
@@ -276,14 +273,11 @@ def test_gps_fixes_of_images_and_of_times(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, [*command, "--timestamps", "names", "--timestamps-unit", "s"])
     assert done.exit_code == 0, done.output
     assert "2  fixes, from exif" in done.output
-    for bad, named in (
-        ("image,latitude,longitude\n0.png,x,8\n", r"fixes\.csv, line 2"),
-        ("image,latitude,longitude\n0.png,91,8\n", r"fixes\.csv, line 2"),
-        ("latitude\n47\n", r"fixes\.csv, line 2"),
-        ("timestamp,latitude,longitude\n1.7F9,47,8\n", r"fixes\.csv: found the time '1.7F9'"),
-    ):
+    rows = ("image,latitude,longitude\n0.png,x,8\n", "image,latitude,longitude\n0.png,91,8\n", "latitude\n47\n")
+    odd = "timestamp,latitude,longitude\n1.7F9,47,8\n"
+    for bad, named in (*((row, ", line 2") for row in rows), (odd, ": found the time '1.7F9'")):
         fixes.write_text(bad)
-        with pytest.raises(CaptureError, match=named):
+        with pytest.raises(CaptureError, match=rf"fixes\.csv{named}"):
             import_images(folder, tmp_path / "D", fixes=fixes, **options)
 
 

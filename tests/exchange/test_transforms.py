@@ -190,14 +190,11 @@ def test_images_that_cannot_be_used_are_rows(tmp_path: Path) -> None:
     assert "frame 5 (images/lost.jpg), transform_matrix: found [[nan" in status["images/lost.jpg"]
 
 
-@pytest.mark.parametrize(
-    ("stored", "file", "listed", "named"),
-    [
-        ("images", "", "images/", r"has 32 x 24; use images of the camera's size, or .* intrinsics by 2"),
-        ("pictures", "", "images/", r"First: images/0.jpg: no such file. Names are paths in this folder: corr"),
-        ("pictures", "elsewhere", "{}/pictures/", r"not a path inside the folder of images. Names are paths in this"),
-    ],
-)
+@pytest.mark.parametrize(("stored", "file", "listed", "named"), [
+    ("images", "", "images/", r"has 32 x 24; use images of the camera's size, or .* intrinsics by 2"),
+    ("pictures", "", "images/", r"First: images/0.jpg: no such file. Names are paths in this folder: corr"),
+    ("pictures", "elsewhere", "{}/pictures/", r"not a path inside the folder of images. Names are paths in this"),
+])  # fmt: skip
 def test_images_of_another_size_or_place_say_what_to_do(
     stored: str, file: str, listed: str, named: str, tmp_path: Path
 ) -> None:
@@ -372,18 +369,15 @@ def test_absolute_paths_of_another_machine_are_found_by_their_ends(root: str, tm
 FRAMES = [{"file_path": "images/0.jpg", "transform_matrix": matrix(0)}]
 
 
-@pytest.mark.parametrize(
-    ("content", "named"),
-    [
-        (json.dumps({"frames": FRAMES}), r"fl_x: found nothing; .* or camera_angle_x"),
-        (json.dumps(SHARED | {"frames": FRAMES, "applied_transform": [[1, 0], [0, 1]]}), "applied_transform"),
-        *(
-            (text, "an object with a list `frames`")
-            for text in ("", "{", "[]", '{"frames": []}', '{"frames": [1]}', '{"images": 1}', "[" * 100_000)
-        ),
-        (None, "cannot be read"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("content", "named"), [
+    (json.dumps({"frames": FRAMES}), r"fl_x: found nothing; .* or camera_angle_x"),
+    (json.dumps(SHARED | {"frames": FRAMES, "applied_transform": [[1, 0], [0, 1]]}), "applied_transform"),
+    *(
+        (text, "an object with a list `frames`")
+        for text in ("", "{", "[]", '{"frames": []}', '{"frames": [1]}', '{"images": 1}', "[" * 100_000)
+    ),
+    (None, "cannot be read"),
+])  # fmt: skip
 def test_a_file_without_intrinsics_or_frames_is_refused(content: str | None, named: str, tmp_path: Path) -> None:
     file = write(tmp_path, FRAMES)
     file.unlink() if content is None else file.write_text(content)

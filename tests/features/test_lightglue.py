@@ -232,13 +232,10 @@ def test_other_features_are_refused(matcher: LightGlueMatcher) -> None:
             matcher.match([(features(0, 5), other)])
 
 
-@pytest.mark.parametrize(
-    ("checkpoint", "wrong", "named"),
-    [
-        ({}, {"min_score": 1.5}, r"min_score is 1\.5"),
-        (None, {"features": "sift"}, r"no weights for 'sift'\. Known: superpoint, aliked"),
-    ],
-)
+@pytest.mark.parametrize(("checkpoint", "wrong", "named"), [
+    ({}, {"min_score": 1.5}, r"min_score is 1\.5"),
+    (None, {"features": "sift"}, r"no weights for 'sift'\. Known: superpoint, aliked"),
+])  # fmt: skip
 def test_wrong_settings(checkpoint: State | None, wrong: dict[str, Any], named: str) -> None:
     with pytest.raises(ManifestError, match=named):
         LightGlueMatcher(checkpoint, "cpu", **wrong)

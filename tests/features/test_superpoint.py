@@ -199,14 +199,11 @@ def test_the_fingerprint_tells_weights_and_settings_apart(extractor: SuperPointE
     assert planted(max_keypoints=9).settings != planted("bfloat16", max_keypoints=9).settings != planted().settings
 
 
-@pytest.mark.parametrize(
-    ("wrong", "named"),
-    [
-        ({"max_keypoint": 3}, "'max_keypoint'.*max_keypoints"),
-        ({"max_keypoints": 0}, "max_keypoints"),
-        ({"dtype": "float8"}, "dtype_compute is 'float8'"),
-    ],
-)
+@pytest.mark.parametrize(("wrong", "named"), [
+    ({"max_keypoint": 3}, "'max_keypoint'.*max_keypoints"),
+    ({"max_keypoints": 0}, "max_keypoints"),
+    ({"dtype": "float8"}, "dtype_compute is 'float8'"),
+])  # fmt: skip
 def test_wrong_settings(wrong: dict[str, Any], named: str) -> None:
     with pytest.raises(ManifestError, match=named):
         planted(**wrong)

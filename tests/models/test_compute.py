@@ -41,14 +41,11 @@ def test_auto_is_a_device_that_is_here(monkeypatch: pytest.MonkeyPatch) -> None:
     assert resolve_device("cuda:1").index == 1
 
 
-@pytest.mark.parametrize(
-    ("gpus", "asked", "named"),
-    [
-        (0, "cuda", "compute_device is cuda"),
-        (0, "mps", "compute_device is mps"),
-        (2, "cuda:2", "cuda:2.*cuda:0 to cuda:1"),
-    ],
-)
+@pytest.mark.parametrize(("gpus", "asked", "named"), [
+    (0, "cuda", "compute_device is cuda"),
+    (0, "mps", "compute_device is mps"),
+    (2, "cuda:2", "cuda:2.*cuda:0 to cuda:1"),
+])  # fmt: skip
 def test_devices_that_are_not_here_are_refused(
     gpus: int, asked: str, named: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -169,17 +166,11 @@ class Full(torch.nn.Module):
         raise RuntimeError(self.message)
 
 
-@pytest.mark.parametrize(
-    ("text", "error", "named"),
-    [
-        (
-            "CUDA out of memory. Tried to allocate 2 GiB",
-            ToolkitError,
-            "memory of cuda:0.*weights of VGGT.*Tried to allocate",
-        ),
-        ("no kernel image is available", RuntimeError, "no kernel image"),
-    ],
-)
+@pytest.mark.parametrize(("text", "error", "named"), [
+    ("CUDA out of memory. Tried to allocate 2 GiB", ToolkitError,
+     "memory of cuda:0.*weights of VGGT.*Tried to allocate"),
+    ("no kernel image is available", RuntimeError, "no kernel image"),
+])  # fmt: skip
 def test_weights_that_do_not_fit(text: str, error: type[Exception], named: str) -> None:
     with pytest.raises(error, match=named):
         on_device(Full(text), torch.device("cuda:0"), "VGGT")

@@ -130,16 +130,13 @@ def test_the_trained_grid_is_taken_as_it_is(tiny: MegaLoc) -> None:
     assert tiny.backbone._position(4, 7).shape == (1, 29, 24)
 
 
-@pytest.mark.parametrize(
-    ("shape", "dtype", "named"),
-    [
-        ((3, 126, 126), torch.float32, r"expected \(B, 3, H, W\)"),
-        ((1, 4, 126, 126), torch.float32, r"expected \(B, 3, H, W\)"),
-        ((1, 3, 28, 42), torch.float32, "more than 6"),
-        ((1, 3, 6, 500), torch.float32, "more than 6"),
-        ((1, 3, 126, 126), torch.uint8, "uint8"),
-    ],
-)
+@pytest.mark.parametrize(("shape", "dtype", "named"), [
+    ((3, 126, 126), torch.float32, r"expected \(B, 3, H, W\)"),
+    ((1, 4, 126, 126), torch.float32, r"expected \(B, 3, H, W\)"),
+    ((1, 3, 28, 42), torch.float32, "more than 6"),
+    ((1, 3, 6, 500), torch.float32, "more than 6"),
+    ((1, 3, 126, 126), torch.uint8, "uint8"),
+])  # fmt: skip
 def test_images_that_cannot_be_described(tiny: MegaLoc, shape: tuple[int, ...], dtype: torch.dtype, named: str) -> None:
     with pytest.raises(ValueError, match=named):
         tiny(torch.zeros(shape, dtype=dtype))

@@ -1,7 +1,7 @@
 """VGGT-Omega: what a small network of its kind must do, the official loader, and the official numbers."""
 
 import struct
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -198,26 +198,16 @@ def test_what_a_residual_is_added_to(overwrites: bool) -> None:
     assert torch.equal(unit(x), x.clamp(min=0) if overwrites else x)
 
 
-@pytest.mark.parametrize(
-    ("call", "named"),
-    [
-        *(
-            (lambda model, images, shape=shape: model(torch.zeros(shape)), "expected ")
-            for shape in [(3, H, W), (1, 3, 3, H, W + 14), (2, 4, H, W), (0, 3, H, W), (1, 0, 3, H, W)]
-        ),
-        (
-            lambda model, images: model(images, patch_tokens=torch.zeros(2, 3, 11, 32)),
-            r"patch_tokens.*\(2, 3, 12, 32\)",
-        ),
-        (lambda model, images: tiny(("camera",))(images, heads=("depth",)), "heads"),
-        (lambda model, images: VGGTOmega(("point",)), "heads"),
-    ],
-)
-def test_wrong_input_is_refused(
-    model: VGGTOmega, images: torch.Tensor, call: Callable[[VGGTOmega, torch.Tensor], object], named: str
-) -> None:
-    with pytest.raises(ValueError, match=named):
-        call(model, images)
+def test_wrong_input_is_refused(model: VGGTOmega, images: torch.Tensor) -> None:
+    shapes = [(3, H, W), (1, 3, 3, H, W + 14), (2, 4, H, W), (0, 3, H, W), (1, 0, 3, H, W)]
+    for call, named in (
+        *((partial(model, torch.zeros(shape)), "expected ") for shape in shapes),
+        (partial(model, images, patch_tokens=torch.zeros(2, 3, 11, 32)), r"patch_tokens.*\(2, 3, 12, 32\)"),
+        (partial(tiny(("camera",)), images, heads=("depth",)), "heads"),
+        (partial(VGGTOmega, ("point",)), "heads"),
+    ):
+        with pytest.raises(ValueError, match=named):
+            call()
 
 
 # Loading
@@ -283,14 +273,11 @@ def test_sizes_of_images(size: tuple[int, int], balanced: tuple[int, int], max_s
         assert load_images([pixels], mode).images.shape == (1, 3, height, width)
 
 
-@pytest.mark.parametrize(
-    ("images", "mode", "error", "named"),
-    [
-        (["none.png"], [], ImageError, r"none\.png"),
-        ([], [], ValueError, "no images"),
-        ([np.zeros((10, 10, 3), np.uint8)], ["crop"], ValueError, r"crop.*balanced.*max_size"),
-    ],
-)
+@pytest.mark.parametrize(("images", "mode", "error", "named"), [
+    (["none.png"], [], ImageError, r"none\.png"),
+    ([], [], ValueError, "no images"),
+    ([np.zeros((10, 10, 3), np.uint8)], ["crop"], ValueError, r"crop.*balanced.*max_size"),
+])  # fmt: skip
 def test_wrong_images_are_refused(images: list[Any], mode: list[str], error: type[Exception], named: str) -> None:
     with pytest.raises(error, match=named):
         load_images(images, *mode)

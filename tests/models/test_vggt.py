@@ -5,6 +5,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
@@ -280,27 +281,17 @@ def test_position_of_pixels_in_dense_heads() -> None:
     np.testing.assert_allclose(maps[0, :, 2, 4].numpy(), 0.1 * expected, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("call", "named"),
-    [
-        *(
-            (lambda model, images, shape=shape: model(torch.zeros(shape)), "expected ")
-            for shape in [(3, H, W), (1, 3, 3, H, W + 1), (2, 4, H, W), (0, 3, H, W), (1, 0, 3, H, W)]
-        ),
-        (
-            lambda model, images: model(images, patch_tokens=torch.zeros(2, 3, 11, 32)),
-            r"patch_tokens.*\(2, 3, 12, 32\)",
-        ),
-        (lambda model, images: tiny(("camera",))(images, heads=("depth",)), "heads"),
-        *((lambda model, images, heads=heads: VGGT(heads), "heads") for heads in (("track",), (), "camera")),
-        (lambda model, images: model.encode(images), r"expected \(N, 3, H, W\)"),
-    ],
-)
-def test_wrong_input_is_refused(
-    model: VGGT, images: torch.Tensor, call: Callable[[VGGT, torch.Tensor], object], named: str
-) -> None:
-    with pytest.raises(ValueError, match=named):
-        call(model, images)
+def test_wrong_input_is_refused(model: VGGT, images: torch.Tensor) -> None:
+    shapes = [(3, H, W), (1, 3, 3, H, W + 1), (2, 4, H, W), (0, 3, H, W), (1, 0, 3, H, W)]
+    for call, named in (
+        *((partial(model, torch.zeros(shape)), "expected ") for shape in shapes),
+        (partial(model, images, patch_tokens=torch.zeros(2, 3, 11, 32)), r"patch_tokens.*\(2, 3, 12, 32\)"),
+        (partial(tiny(("camera",)), images, heads=("depth",)), "heads"),
+        *((partial(VGGT, heads), "heads") for heads in (("track",), (), "camera")),
+        (partial(model.encode, images), r"expected \(N, 3, H, W\)"),
+    ):
+        with pytest.raises(ValueError, match=named):
+            call()
 
 
 # Loading
@@ -429,17 +420,14 @@ def test_all_kinds_of_sources_are_alike(tmp_path: Path) -> None:
     assert torch.equal(gray[:, 0], gray[:, 2])
 
 
-@pytest.mark.parametrize(
-    ("images", "mode", "error", "named"),
-    [
-        (["none.png"], "crop", ImageError, r"none\.png"),
-        (["torn.png"], "crop", ImageError, r"torn\.png"),
-        ([np.zeros((10, 1000, 3), np.uint8)], "crop", ImageError, "1000 x 10 pixels"),
-        ([np.zeros((1000, 10, 3), np.uint8)], "pad", ImageError, "10 x 1000 pixels"),
-        ([], "crop", ValueError, "no images"),
-        ([np.zeros((10, 10, 3), np.uint8)], "stretch", ValueError, "stretch"),
-    ],
-)
+@pytest.mark.parametrize(("images", "mode", "error", "named"), [
+    (["none.png"], "crop", ImageError, r"none\.png"),
+    (["torn.png"], "crop", ImageError, r"torn\.png"),
+    ([np.zeros((10, 1000, 3), np.uint8)], "crop", ImageError, "1000 x 10 pixels"),
+    ([np.zeros((1000, 10, 3), np.uint8)], "pad", ImageError, "10 x 1000 pixels"),
+    ([], "crop", ValueError, "no images"),
+    ([np.zeros((10, 10, 3), np.uint8)], "stretch", ValueError, "stretch"),
+])  # fmt: skip
 def test_wrong_images_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, images: list[Any], mode: str, error: type[Exception], named: str
 ) -> None:

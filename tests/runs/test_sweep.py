@@ -163,15 +163,12 @@ def test_a_long_name_is_cut_and_still_its_own() -> None:
     assert len(set(names)) == 2
 
 
-@pytest.mark.parametrize(
-    ("swept", "only", "said"),
-    [
-        ("localize.method=pnp,nearest", "retreive", "no such stage"),
-        ("localize.method=pnp,nearest", "rerank", "so the stage is off"),
-        ("retrieve.topk=3,five", None, r"retrieve\.topk: found 'five'"),
-        ("embed.model=vlad,vald", None, r"x\.yaml: embed: Unknown embedder 'vald'\. Did you mean 'vlad'\?"),
-    ],
-)
+@pytest.mark.parametrize(("swept", "only", "said"), [
+    ("localize.method=pnp,nearest", "retreive", "no such stage"),
+    ("localize.method=pnp,nearest", "rerank", "so the stage is off"),
+    ("retrieve.topk=3,five", None, r"retrieve\.topk: found 'five'"),
+    ("embed.model=vlad,vald", None, r"x\.yaml: embed: Unknown embedder 'vald'\. Did you mean 'vlad'\?"),
+])  # fmt: skip
 def test_a_sweep_that_cannot_run_is_refused_before_any_work(
     swept: str, only: str | None, said: str, tmp_path: Path
 ) -> None:

@@ -92,15 +92,12 @@ def test_the_same_seed_gives_the_same_bytes(scene: Path, arranged: dict[bool, Pa
     assert [path.read_bytes() for path in files[0]] != [path.read_bytes() for path in files[1]]
 
 
-@pytest.mark.parametrize(
-    ("asked", "broken", "out", "named"),
-    [
-        ("wal", "", "WALL", "wal.*Did you mean 'wall'"),
-        ("wall", "gt_dense_cameras/0000.jpg.camera", "WALL", r"0000\.jpg\.camera"),
-        ("wall", "images/0000.jpg", "WALL", r"0000\.jpg: no such image"),
-        ("wall", "", "full", "full"),
-    ],
-)
+@pytest.mark.parametrize(("asked", "broken", "out", "named"), [
+    ("wal", "", "WALL", "wal.*Did you mean 'wall'"),
+    ("wall", "gt_dense_cameras/0000.jpg.camera", "WALL", r"0000\.jpg\.camera"),
+    ("wall", "images/0000.jpg", "WALL", r"0000\.jpg: no such image"),
+    ("wall", "", "full", "full"),
+])  # fmt: skip
 def test_what_is_no_scene_is_refused(asked: str, broken: str, out: str, named: str, tmp_path: Path) -> None:
     write_scene(tmp_path / "scenes" / "wall", 1)
     (tmp_path / "full").mkdir()
