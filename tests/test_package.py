@@ -6,16 +6,23 @@ import subprocess
 import sys
 import venv
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
+from tests.sequences.drifting import drive
 from toolkit import __version__
 from toolkit.__main__ import app
 from toolkit.errors import EXTRAS, ManifestError
-from toolkit.manifest import LocalizeSettings, find_manifest, load_manifest
+from toolkit.features.features import create_extractor
+from toolkit.manifest import FeaturesSettings, LocalizeSettings, SequenceSettings, find_manifest, load_manifest
+from toolkit.runs.cluster import open_cluster
+from toolkit.sequences.pose_graph import place_piece
 
+WAY = drive(np.random.default_rng(6))
 ROOT = Path(__file__).resolve().parents[1]
 WITHOUT_EXTRAS = """
 import sys
@@ -42,10 +49,23 @@ def test_a_manifest_of_the_toolkit_is_found_by_its_name_from_any_folder(
     assert load_manifest(find_manifest("demo")).description == "mine", "a user's own comes first"
     Path("other.yaml").write_text("description: beside\n")
     assert find_manifest("other.yaml") == Path("other.yaml")
-    with pytest.raises(ManifestError, match=r"dmeo: .*Did you mean 'demo'"):
-        find_manifest("dmeo")
-    with pytest.raises(ManifestError, match=r"gone.*demo\.yaml"):  # a folder is named: this very file is meant
-        load_manifest(find_manifest("gone/demo.yaml"))
+    # Where a folder is named, this very file is meant.
+    for name, named in (("dmeo", "dmeo: .*Did you mean 'demo'"), ("gone/demo.yaml", r"gone.*demo\.yaml")):
+        with pytest.raises(ManifestError, match=named):
+            load_manifest(find_manifest(name))
+
+
+@pytest.mark.parametrize(("package", "ask", "installed"), [
+    ("distributed", lambda: open_cluster("local").__enter__(), "dask-jobqueue"),
+    ("transformers", lambda: create_extractor("superpoint", FeaturesSettings()), "'transformers"),
+    ("gtsam", lambda: place_piece(WAY.odometry, WAY.queries, SequenceSettings()), "gtsam"),
+])  # fmt: skip
+def test_without_an_extra_one_sentence_says_what_to_install(
+    package: str, ask: Callable[[], object], installed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ManifestError, match=f"{package} cannot be imported .* pip install .*{installed}"):
+        ask()
 
 
 def test_one_branch_of_the_settings_is_shown(capsys: pytest.CaptureFixture[str]) -> None:

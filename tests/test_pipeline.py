@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import nbformat
@@ -20,7 +19,7 @@ from nbformat.v4 import new_code_cell, new_notebook, new_output
 from safetensors.torch import save_file
 
 from toolkit import notebook, pipeline
-from toolkit.errors import COMMAND_VARIABLE, ManifestError, ToolkitError, WeightsError
+from toolkit.errors import COMMAND_VARIABLE, CaptureError, ManifestError, WeightsError
 from toolkit.files import SceneFiles, write_sidecar, write_text
 from toolkit.manifest import (
     STAGES,
@@ -135,9 +134,7 @@ def test_stages_are_executed_in_kernels_and_recorded(place: Path) -> None:
     assert (place / "runs/run/P/embeddings/log.txt").read_text() == "vlad True\n"
 
 
-def test_a_stage_runs_again_only_when_something_has_changed(
-    place: Path, go: Callable[..., dict[str, str]]
-) -> None:
+def test_a_stage_runs_again_only_when_something_has_changed(place: Path, go: Callable[..., dict[str, str]]) -> None:
     done, reused = "done", "reused"
     assert go() == {"embed": done, "retrieve": done}
     jsonl = place / "runs/run/P/retrieval/P_map_all_query_all.jsonl"
@@ -194,19 +191,6 @@ def test_a_sweep_takes_over_what_a_failed_run_came_to(place: Path, monkeypatch: 
     folders, failed = pipeline.sweep(place / "run.yaml", ["retrieve.topk=90,5"], say=lambda *_, **__: None)
     assert (len(folders), len(failed)) == (1, 1)
     assert (folders[0] / "P/embeddings/log.txt").stat().st_nlink == 2
-
-
-@pytest.mark.parametrize(
-    ("sweep", "said"),
-    [
-        ("retrieve.topk=3,five", r"retrieve\.topk: found 'five'"),
-        ("embed.model=vlad,vald", r"run\.yaml: embed: Unknown embedder 'vald'\. Did you mean 'vlad'\?"),
-    ],
-)
-def test_a_sweep_with_a_wrong_value_is_refused_before_anything_runs(place: Path, sweep: str, said: str) -> None:
-    with pytest.raises(ManifestError, match=said):
-        pipeline.sweep(place / "run.yaml", [sweep])
-    assert not (place / "runs").exists()
 
 
 def test_damage_in_what_a_stage_left_makes_it_run_again(place: Path, go: Callable[..., dict[str, str]]) -> None:
@@ -322,18 +306,17 @@ def test_reranking_is_switched_on_by_its_section(place: Path, monkeypatch: pytes
     more = asked("rerank.topn=50")
     assert (more["retrieve"]["topk"], more["rerank"]["topn"]) == (50, 50)
     assert asked("rerank=true", "retrieve.topk=40")["retrieve"]["topk"] == 40
-    with pytest.raises(ManifestError, match=r"rerank\.topn.*50.*retrieve\.topk.*40"):
-        asked("rerank.topn=50", "retrieve.topk=40")
-    with pytest.raises(ManifestError, match=r"rerank\.top_n.*topn"):
-        asked("rerank.top_n=50")
-    with pytest.raises(ManifestError, match="rerank"):
-        pipeline.run(place / "run.yaml", only="rerank")
+    for ask, named in (
+        (lambda: asked("rerank.topn=50", "retrieve.topk=40"), r"rerank\.topn.*50.*retrieve\.topk.*40"),
+        (lambda: asked("rerank.top_n=50"), r"rerank\.top_n.*topn"),
+        (lambda: pipeline.run(place / "run.yaml", only="rerank"), "rerank"),
+    ):
+        with pytest.raises(ManifestError, match=named):
+            ask()
 
 
 @pytest.mark.slow
-def test_a_failing_cell_stops_with_its_message_and_the_notebook(
-    place: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failing_cell_stops_with_its_message_and_the_notebook(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     reports: list[str] = []
     monkeypatch.setattr(
         pipeline, "_write_report", lambda run: reports.append(json.loads((run / "run.json").read_text())["status"])
@@ -357,29 +340,24 @@ def test_unknown_parameters_are_refused(place: Path) -> None:
         pipeline.execute(place / "notebooks/03_retrieve.ipynb", place / "out.ipynb", {"top_k": 5})
 
 
-def test_a_notebook_refuses_what_papermill_injected(monkeypatch: pytest.MonkeyPatch) -> None:
-    shell = SimpleNamespace(user_ns={"In": ["", "topk = 10  # a user's cell", "# Parameters\ntop_k = 5\n"]})
-    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
-    with pytest.raises(ManifestError, match=r"top_k: 03_retrieve\.ipynb .*topk"):
-        notebook.start("retrieve", sessions_root="anywhere/sessions")
-
-
 def test_parameters_must_be_literals(tmp_path: Path) -> None:
     write_notebook(tmp_path, "embed", "a = 1\nb = a + 1", "")
     with pytest.raises(ManifestError, match=r"02_embed\.ipynb"):
         notebook.notebook_parameters(tmp_path / "02_embed.ipynb")
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({"only": "embedd"}, "embed"),
-        ({"overrides": ["captures=[Q]"]}, "Q"),
-        ({"overrides": ["devices=[spot]"]}, "devices"),
-    ],
-)
-def test_what_cannot_run_is_refused(place: Path, options: dict[str, object], expected: str) -> None:
-    with pytest.raises(ToolkitError, match=expected):
+@pytest.mark.parametrize(("options", "error", "expected"), [
+    ({"only": "embedd"}, ManifestError, "embed"),
+    ({"overrides": ["captures=[Q]"]}, CaptureError, "Q"),
+    ({"overrides": ["devices=[spot]"]}, ManifestError, "devices"),
+    ({"overrides": ["embed.model=megalok"]}, ManifestError, "megalok.*megaloc"),
+    ({"overrides": ["output_root=run.yaml/runs"]}, ManifestError, r"output_root: .*run\.yaml/runs"),
+])  # fmt: skip
+def test_what_cannot_run_is_refused(
+    place: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, object], error: type[Exception], expected: str
+) -> None:
+    monkeypatch.chdir(place)
+    with pytest.raises(error, match=expected):
         pipeline.run(place / "run.yaml", **options)
 
 
@@ -461,26 +439,15 @@ def test_a_stage_that_was_stopped_is_not_taken_for_the_one_before(
     assert go() == {"embed": "reused", "retrieve": "done"}, "its notebook is not of a whole execution any more"
 
 
-def test_output_that_cannot_be_written_is_said(place: Path) -> None:
-    (place / "file").write_text("in the way")
-    with pytest.raises(ManifestError, match=r"output_root: .*file/runs"):
-        pipeline.run(place / "run.yaml", overrides=[f"output_root={place}/file/runs"])
-
-
 @pytest.mark.usefixtures("no_hub")
 def test_without_weights_nothing_is_run(place: Path, go: Callable[..., dict[str, str]]) -> None:
-    with pytest.raises(WeightsError, match=r"`embed\.model: vlad`"):
+    with pytest.raises(WeightsError):
         go("embed.model=megaloc")
     assert not (place / "runs/run/run.json").exists()
     assert go("embed.model=auto") == {"embed": "done", "retrieve": "done"}
     assert (place / "runs/run/P/embeddings/log.txt").read_text() == "vlad True\n"
     # What is up to date needs no weights any more.
     assert go("embed.model=megaloc", only="retrieve")["retrieve"] == "reused"
-
-
-def test_an_unknown_embedder_is_refused_at_once(go: Callable[..., dict[str, str]]) -> None:
-    with pytest.raises(ManifestError, match=r"megalok.*megaloc"):
-        go("embed.model=megalok")
 
 
 @pytest.mark.usefixtures("no_hub")

@@ -49,12 +49,13 @@ def test_the_device_refuses_what_an_accelerator_refuses(device: None) -> None:
     there = torch.arange(6.0).to(DEVICE)
     assert there.add_(1) is there
     np.testing.assert_array_equal(there.cpu().numpy(), np.arange(1.0, 7))
-    with pytest.raises(RuntimeError, match="same device"):
-        there + torch.ones(6)
-    with pytest.raises(RuntimeError, match="numpy"):
-        there.numpy()
-    with pytest.raises(TypeError, match="float64"):
-        there.double()
+    for wrong, error, named in (
+        (lambda: there + torch.ones(6), RuntimeError, "same device"),
+        (there.numpy, RuntimeError, "numpy"),
+        (there.double, TypeError, "float64"),
+    ):
+        with pytest.raises(error, match=named):
+            wrong()
 
 
 def test_megaloc(device: None) -> None:

@@ -40,7 +40,6 @@ def test_keys_that_a_reader_needs_are_asked_for(tmp_path: Path) -> None:
     path = tmp_path / "pair.jsonl"
     path.write_text(json.dumps({key: value for key, value in ROW.items() if key != "path"}))
     assert read_references(path)[0]["sensor_id"] == "a"
-    with pytest.raises(ArtifactError, match="path, sensor_id, timestamp, topk"):
-        read_references(path, "path")
-    with pytest.raises(ArtifactError, match=r"none\.jsonl"):
-        read_references(tmp_path / "none.jsonl")
+    for file, named in ((path, "path, sensor_id, timestamp, topk"), (tmp_path / "none.jsonl", r"none\.jsonl")):
+        with pytest.raises(ArtifactError, match=named):
+            read_references(file, "path")

@@ -350,11 +350,6 @@ def test_a_network_matches_all_references_of_a_query_at_once(
     assert reranked(files).read_bytes() == expected
 
 
-def test_a_matcher_that_does_not_suit_is_refused(small_capture: Path, files: SceneFiles) -> None:
-    with pytest.raises(ManifestError, match="lightglue"):
-        run(small_capture, files, matcher="lightglue")
-
-
 def test_an_image_without_features_is_named(small_capture: Path, files: SceneFiles, tmp_path: Path) -> None:
     capture = Path(shutil.copytree(small_capture, tmp_path / "data" / small_capture.name))
     session = Capture.open(capture)["hl_query"]
@@ -378,18 +373,19 @@ def test_sessions_may_have_the_names_of_lamar(small_capture: Path, files: SceneF
 
 
 def test_wrong_settings_and_files_are_refused(small_capture: Path, files: SceneFiles) -> None:
-    with pytest.raises(ManifestError, match="topk is 7"):
-        run(small_capture, files, topk=7)
     path = files.retrieval("ios", "hl")
-    path.write_text(path.read_text() + "{}\n")
-    with pytest.raises(ArtifactError, match=r"\.jsonl, line \d+"):
-        run(small_capture, files)
-    path.write_text(path.read_text().splitlines()[0].replace("ios_map/raw_data/", "ios_map/raw_data/x") + "\n")
-    with pytest.raises(ArtifactError, match="belongs to another capture"):
-        run(small_capture, files)
-    path.unlink()
-    with pytest.raises(ArtifactError, match="Run the retrieve stage first"):
-        run(small_capture, files)
+    whole = path.read_text()
+    elsewhere = whole.splitlines()[0].replace("ios_map/raw_data/", "ios_map/raw_data/x")
+    for text, options, error, named in (
+        (whole, {"matcher": "lightglue"}, ManifestError, "lightglue"),
+        (whole, {"topk": 7}, ManifestError, "topk is 7"),
+        (whole + "{}\n", {}, ArtifactError, rf"\.jsonl, line {whole.count(chr(10)) + 1}"),
+        (elsewhere + "\n", {}, ArtifactError, "belongs to another capture"),
+        (None, {}, ArtifactError, "Run the retrieve stage first"),
+    ):
+        path.write_text(text) if text else path.unlink()
+        with pytest.raises(error, match=named):
+            run(small_capture, files, **options)
 
 
 def test_map_images_in_memory_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

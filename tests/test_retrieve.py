@@ -5,6 +5,7 @@ import re
 import shutil
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -31,9 +32,7 @@ def test_search_is_the_sorted_product(backend: str) -> None:
     rng = np.random.default_rng(0)
     query, database = rng.normal(size=(7, 12)), rng.normal(size=(200, 12))
     scores, indices = search(query, database, 5, backend)
-    full = (query.astype(np.float32).astype(float) @ database.astype(np.float32).astype(float).T).astype(
-        np.float32
-    )
+    full = (query.astype(np.float32).astype(float) @ database.astype(np.float32).astype(float).T).astype(np.float32)
     np.testing.assert_array_equal(indices, np.argsort(-full, axis=1, kind="stable")[:, :5])
     np.testing.assert_allclose(scores, -np.sort(-full, axis=1)[:, :5], rtol=1e-6)
 
@@ -164,19 +163,18 @@ def test_search_limits() -> None:
     scores, indices = search(np.ones((2, 3)), np.ones((4, 3), np.float16), 10)
     assert indices.tolist() == [[0, 1, 2, 3]] * 2, "k beyond the database: all of it"
     assert search(np.ones((0, 3)), np.ones((4, 3)), 2)[0].shape == (0, 2)
-    with pytest.raises(ValueError, match=r"\b2 .*\b3\b"):
-        search(np.ones((2, 2)), np.ones((4, 3)), 1)
-    with pytest.raises(ValueError, match=r"database.*row 2\b"):
-        search(np.ones((2, 3)), np.array([[0, 0, 0], [1, 1, 1], [0, np.nan, 1]]), 1)
-    with pytest.raises(ValueError, match=r"\bk\b.*\b0\b"):
-        search(np.ones((2, 3)), np.ones((4, 3)), 0)
-    with pytest.raises(ValueError, match="shape"):
-        search(np.ones(3), np.ones((4, 3)), 1)
-    with pytest.raises(ValueError, match="1 masks of 9 rows for 2 queries and 4 rows"):
-        search(np.ones((2, 3)), np.ones((4, 3)), 1, allowed=Masks.of([], np.array([-1]), 9))
-    for allowed in (np.ones(3, bool), np.ones((2, 4), bool)):
-        with pytest.raises(ValueError, match=r"allowed has shape .*\(4,\)"):
-            search(np.ones((2, 3)), np.ones((4, 3)), 1, allowed=allowed)
+    two, four, nine = np.ones((2, 3)), np.ones((4, 3)), Masks.of([], np.array([-1]), 9)
+    for query, database, k, allowed, named in (
+        (np.ones((2, 2)), four, 1, None, r"\b2 .*\b3\b"),
+        (two, np.array([[0, 0, 0], [1, 1, 1], [0, np.nan, 1]]), 1, None, r"database.*row 2\b"),
+        (two, four, 0, None, r"\bk\b.*\b0\b"),
+        (np.ones(3), four, 1, None, "shape"),
+        (two, four, 1, nine, "1 masks of 9 rows for 2 queries and 4 rows"),
+        (two, four, 1, np.ones(3, bool), r"allowed has shape .*\(4,\)"),
+        (two, four, 1, np.ones((2, 4), bool), r"allowed has shape .*\(4,\)"),
+    ):
+        with pytest.raises(ValueError, match=named):
+            search(query, database, k, allowed=allowed)
     assert scores.dtype == np.float32
 
 
@@ -250,9 +248,7 @@ def test_an_index_is_made_once_and_part_of_what_files_are_made_of(tiny: Path, tm
     assert index.stat().st_ino != made, "of fewer images"
 
 
-def test_missing_images_and_poses_are_reported(
-    tiny: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_missing_images_and_poses_are_reported(tiny: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     for name in ("left/1000.png", "right/1000.png", "right/1010.png"):
         (tiny / "sessions" / "hl_query" / "raw_data" / "hl_a" / "images" / name).unlink()
     poses = tiny / "sessions" / "hl_map" / "trajectories.txt"
@@ -291,43 +287,39 @@ def test_vectors_of_two_vocabularies_are_not_compared(tiny: Path, tmp_path: Path
         load_embeddings(tmp_path / "embeddings/hl_map")
 
 
-def test_refused(tiny: Path, tmp_path: Path) -> None:
-    sessions, embeddings = tiny / "sessions", tmp_path / "embeddings"
-    with pytest.raises(ArtifactError, match="--only embed"):
-        retrieve_pairs(sessions, tmp_path / "nowhere")
-    with pytest.raises(CaptureError, match=r"'spot'.*ios, hl"):
-        retrieve_pairs(sessions, embeddings, map_device="spot")
-    with pytest.raises(CaptureError, match="pruned_subsampled"):
-        retrieve_pairs(sessions, embeddings, queries="nope")
-    with pytest.raises(ManifestError, match=r"one\.jsonl"):
-        retrieve_pairs(sessions, embeddings, out_jsonl=tmp_path / "one.jsonl")
-    with pytest.raises(ManifestError, match="topk"):
-        retrieve_pairs(sessions, embeddings, settings={"topk": 0})
+@pytest.mark.parametrize(("folder", "options", "error", "named"), [
+    ("nowhere", {}, ArtifactError, "--only embed"),
+    ("embeddings", {"map_device": "spot"}, CaptureError, "'spot'.*ios, hl"),
+    ("embeddings", {"queries": "nope"}, CaptureError, "pruned_subsampled"),
+    ("embeddings", {"out_jsonl": "one.jsonl"}, ManifestError, r"one\.jsonl"),
+    ("embeddings", {"settings": {"topk": 0}}, ManifestError, "topk"),
+])  # fmt: skip
+def test_refused(
+    tiny: Path, tmp_path: Path, folder: str, options: dict[str, Any], error: type[Exception], named: str
+) -> None:
+    with pytest.raises(error, match=named):
+        retrieve_pairs(tiny / "sessions", tmp_path / folder, **options)
 
 
 def test_embeddings_that_do_not_fit(tiny: Path, tmp_path: Path) -> None:
     folder = tmp_path / "embeddings" / "ios_map" / "ios_a"
     matrix, table = load_embeddings(folder)
     assert table["subsession"].unique().tolist() == ["ios_a"]
-    np.save(folder / "ios_a.npy", matrix[:, :3])
-    asked = {"map_device": "ios", "query_device": "hl", "skip_existing": False}
-    with pytest.raises(ArtifactError, match=r"ios_a\.npy is damaged"):
-        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", **asked)
-    sidecar_path(folder / "ios_a.npy").unlink()  # another tool's, from now on
-    with pytest.raises(ArtifactError, match="model"):
-        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", **asked)
-    np.save(folder / "ios_a.npy", np.full_like(matrix, np.nan))
-    with pytest.raises(ArtifactError, match="NaN"):
-        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", **asked)
-    np.save(folder / "ios_a.npy", matrix[1:])
-    with pytest.raises(ArtifactError, match=r"ios_a\.npy"):
-        load_embeddings(folder)
-    np.save(folder / "ios_a.npy", matrix)
-    manifest = pd.read_csv(folder / "manifest.csv")
-    manifest["abs_path"] = manifest["abs_path"].str.replace("1000", "9")
-    manifest.to_csv(folder / "manifest.csv", index=False)
-    with pytest.raises(ArtifactError, match=r"cam/9\.png"):
-        retrieve_pairs(tiny / "sessions", tmp_path / "embeddings", **asked)
+    manifest = (folder / "manifest.csv").read_text()
+    for wrong, listed, named in (
+        (matrix[:, :3], manifest, r"ios_a\.npy is damaged"),
+        (matrix[:, :3], manifest, "model"),  # another tool's, from now on
+        (np.full_like(matrix, np.nan), manifest, "NaN"),
+        (matrix[1:], manifest, r"ios_a\.npy"),
+        (matrix, manifest.replace("1000.png", "9.png"), r"cam/9\.png"),
+    ):
+        np.save(folder / "ios_a.npy", wrong)
+        (folder / "manifest.csv").write_text(listed)
+        with pytest.raises(ArtifactError, match=named):
+            retrieve_pairs(
+                tiny / "sessions", tmp_path / "embeddings", map_device="ios", query_device="hl", skip_existing=False
+            )
+        sidecar_path(folder / "ios_a.npy").unlink(missing_ok=True)
 
 
 @pytest.mark.parametrize(
@@ -391,9 +383,7 @@ def first_walls(path: str | Path) -> list[int]:
 
 
 @pytest.mark.usefixtures("short_window")
-def test_references_come_from_where_radio_says(
-    tiny: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_references_come_from_where_radio_says(tiny: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     asked = {"map_device": "hl", "query_device": "hl"}
 
     def retrieve(**mask: object) -> pd.Series:

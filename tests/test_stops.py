@@ -266,8 +266,8 @@ def test_a_signal_is_heard_whatever_a_command_imports() -> None:
     assert (done.returncode, done.stderr) == (143, "Interrupted. The same command goes on from here.\n")
 
 
-def test_another_run_in_the_folder_is_named(here: Path) -> None:
-    with held(here / "runs" / "run"), pytest.raises(ToolkitError, match=f"process {os.getpid()} on "):
+def test_a_folder_has_one_run_at_a_time(here: Path) -> None:
+    with held(here / "runs" / "run"), pytest.raises(ToolkitError):
         pipeline.run(here / "run.yaml", say=quiet)
     pipeline.run(here / "run.yaml", say=quiet)
     assert record_of(here)["status"] == "done"
@@ -417,41 +417,6 @@ def test_what_builds_on_a_failed_stage_is_skipped(here: Path) -> None:
     assert (record["status"], record["exit_code"]) == ("failed", 1)
 
 
-@pytest.mark.parametrize(
-    ("stage", "values", "named"),
-    [
-        ("retrieve", {"topk": "ten"}, "topk"),
-        ("retrieve", {"map_device": 3}, "map_device: found 3"),
-        ("retrieve", {"sessions_root": 5}, "sessions_root: found 5"),
-        ("localize", {"skip_existing": "yes"}, "skip_existing: found 'yes'"),
-        ("localize", {"settings": [1]}, r"\[1\]"),
-        ("localize", {"method": "pmp"}, "method: found 'pmp'. Did you mean 'pnp'. Known: feed_forward, hybrid"),
-        ("localize", {"settings": {"predictor": {"num_references": "five"}}}, "num_references: found 'five'"),
-        ("localize", {"features": "sfit"}, "'sfit'. Did you mean 'sift'. Known: aliked, auto"),
-        ("localize", {"features": "auto", "matcher": "mutuel"}, "'mutuel'. Did you mean 'mutual'. Known: lightglue"),
-        ("rerank", {"matcher": "mutuel"}, "Did you mean 'mutual'"),
-        ("embed", {"model": "vald"}, "'vald'. Did you mean 'vlad'. Known: auto, megaloc"),
-        ("embed", {"settings": {"model": ["vlad", "megalok"]}}, "Did you mean 'megaloc'"),
-        ("embed", {"compute_device": "cude"}, "found 'cude'. Meaning: Device of the network: auto, cpu, cuda"),
-        ("retrieve", {"settings": {"index": "IVF4096,Flot"}}, "index: found 'IVF4096,Flot', expected Flat"),
-        ("evaluate", {"pairs": "ios"}, "pairs: found 'ios'"),
-        ("evaluate", {"pairs": [["ios"]]}, "pairs"),
-        ("embed", {"batch_size": 0.5}, "batch_size"),
-        ("own_images", {"device": 5}, "device.*: found 5"),
-        ("own_images", {"unit_m": "cm"}, "unit_m: found 'cm'"),
-        ("own_images", {"unit_m": True}, "unit_m: found True"),
-        ("compare", {"others": "../runs/a"}, "others: found '../runs/a'"),
-        ("compare", {"others": [5]}, r"others.*: found 5"),
-        ("compare", {"run": 5}, "run: found 5"),
-        ("compare", {"pictures": "two"}, "pictures: found 'two'"),
-        ("compare", {"seed": -1}, "seed: found -1"),
-    ],
-)
-def test_notebook_parameters_of_a_wrong_type_are_named(stage: str, values: dict[str, Any], named: str) -> None:
-    with pytest.raises(ManifestError, match=named):
-        notebook.check_values(stage, values)
-
-
 @pytest.mark.parametrize("unit", [None, 1, 0.01])
 def test_the_unit_of_poses_may_be_a_whole_number_or_unknown(unit: float | None, tmp_path: Path) -> None:
     (tmp_path / "poses.csv").touch()
@@ -480,15 +445,22 @@ def test_a_notebook_that_is_no_stage_looks_at_its_parameters(
         notebook.check_given("own_images")
 
 
-@pytest.mark.parametrize(
-    ("asked", "message"),
-    [
-        ({"map_device": "all", "query_device": "oss"}, r"device 'oss'.*: ios"),
-        ({"queries": "keyframes_evry"}, r"'keyframes_evry'.*every"),
-    ],
-)
+INJECTED = {"In": ["", "topk = 10  # a user's cell", "# Parameters\ntop_k = 5\n"]}  # by papermill
+
+
+@pytest.mark.parametrize(("stage", "asked", "error", "message"), [
+    ("localize", {"map_device": "all", "query_device": "oss"}, CaptureError, "device 'oss'.*: ios"),
+    ("localize", {"queries": "keyframes_evry"}, CaptureError, "'keyframes_evry'.*every"),
+    ("retrieve", {"topk": "ten"}, ManifestError, "topk"),
+    ("retrieve", INJECTED, ManifestError, r"top_k: 03_retrieve\.ipynb .*topk"),
+])  # fmt: skip
 def test_a_notebook_looks_for_what_it_is_asked_before_earlier_stages_are_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: dict[str, str], message: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    stage: str,
+    asked: dict[str, Any],
+    error: type[Exception],
+    message: str,
 ) -> None:
     for session in ("ios_map", "ios_query"):
         (tmp_path / "P" / "sessions" / session / "proc").mkdir(parents=True)
@@ -498,15 +470,8 @@ def test_a_notebook_looks_for_what_it_is_asked_before_earlier_stages_are_made(
     shell = SimpleNamespace(user_ns={"In": [""], **asked})
     monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
     monkeypatch.setattr(notebook, "_make_upstream", lambda *_: pytest.fail("made"))
-    with pytest.raises(CaptureError, match=message):
-        notebook.start("localize", sessions_root=str(tmp_path / "P" / "sessions"))
-
-
-def test_a_notebook_looks_at_its_parameters_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    shell = SimpleNamespace(user_ns={"In": [""], "topk": "ten"})
-    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
-    with pytest.raises(ManifestError, match="topk"):
-        notebook.start("retrieve", sessions_root="nowhere/sessions", out_jsonl="nowhere")
+    with pytest.raises(error, match=message):
+        notebook.start(stage, sessions_root=str(tmp_path / "P" / "sessions"))
 
 
 def test_an_error_of_a_place_says_what_was_found_expected_and_is_to_do() -> None:

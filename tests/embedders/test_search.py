@@ -109,8 +109,10 @@ def test_an_index_is_kept_until_its_vectors_or_settings_change(place: Path, tmp_
     embeddings, vectors = tmp_path / "embeddings", stored(place)
     settings = RetrieveSettings(index="IVF16,Flat", index_candidates=10)
     path = tmp_path / "index" / "ios_map.faiss"
-    with pytest.raises(ArtifactError, match=r"ios_map\.faiss.*Retrieve again"):
-        load_index(embeddings, "ios_map", vectors, settings)
+
+    def refuses(named: str, theirs: Vectors = vectors, wanted: RetrieveSettings = settings) -> None:
+        with pytest.raises(ArtifactError, match=rf"ios_map\.faiss.*{named}"):
+            load_index(embeddings, "ios_map", theirs, wanted)
 
     def made(settings: RetrieveSettings = settings, vectors: Vectors = vectors) -> bool:
         before = path.stat().st_ino if path.exists() else None
@@ -119,6 +121,7 @@ def test_an_index_is_kept_until_its_vectors_or_settings_change(place: Path, tmp_
         assert index.indexes[0].ntotal == len(vectors)
         return path.stat().st_ino != before
 
+    refuses("Retrieve again")
     assert [made(), made()] == [True, False]
     assert not made(settings.model_copy(update={"nprobe": 3, "index_candidates": 20}))
     assert made(settings.model_copy(update={"index": "IVF8,RaBitQ"}))
@@ -126,18 +129,15 @@ def test_an_index_is_kept_until_its_vectors_or_settings_change(place: Path, tmp_
     assert made(vectors=fewer)
     others = [(vectors, settings), (stored(place, False).choose(np.arange(1, 1598)), settings)]
     for theirs, wanted in [*others, (fewer, settings.model_copy(update={"index": "RaBitQ"}))]:
-        with pytest.raises(ArtifactError, match=r"ios_map\.faiss: .* from other embeddings, poses or settings"):
-            load_index(embeddings, "ios_map", theirs, wanted)
+        refuses("from other embeddings, poses or settings", theirs, wanted)
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 255
     path.write_bytes(content)
-    with pytest.raises(ArtifactError, match="damaged"):
-        load_index(embeddings, "ios_map", vectors, settings)
+    refuses("damaged")
     assert made()
     path.write_bytes(b"no index")
     sidecar_path(path).unlink()
-    with pytest.raises(ArtifactError, match=r"ios_map\.faiss.*cannot be read"):
-        load_index(embeddings, "ios_map", vectors, settings)
+    refuses("cannot be read")
 
 
 def test_an_index_is_of_its_embeddings(place: Path, tmp_path: Path) -> None:
@@ -147,7 +147,7 @@ def test_an_index_is_of_its_embeddings(place: Path, tmp_path: Path) -> None:
     assert load_index(tmp_path / "embeddings", "ios_map", vectors, settings) is not None
     matrix = np.load(vectors.parts[""].paths[1])
     np.save(vectors.parts[""].paths[1], matrix[::-1])
-    with pytest.raises(ArtifactError, match="from other embeddings"):
+    with pytest.raises(ArtifactError):
         load_index(tmp_path / "embeddings", "ios_map", vectors, settings)
 
 

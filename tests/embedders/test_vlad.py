@@ -126,22 +126,22 @@ def test_one_image_is_enough() -> None:
 
 
 def test_a_file_that_is_no_vocabulary(tmp_path: Path) -> None:
-    with pytest.raises(ArtifactError, match="run the embed stage"):
-        Vlad.load(tmp_path / "none.npz")
     (tmp_path / "torn.npz").write_bytes(b"PK\x03\x04torn")
-    with pytest.raises(ArtifactError, match=r"torn\.npz"):
-        Vlad.load(tmp_path / "torn.npz")
+    for name, named in (("none.npz", "run the embed stage"), ("torn.npz", r"torn\.npz")):
+        with pytest.raises(ArtifactError, match=named):
+            Vlad.load(tmp_path / name)
 
 
 @pytest.mark.usefixtures("no_hub")
 def test_names(tmp_path: Path) -> None:
     assert resolve_name("auto") == "vlad"
-    with pytest.raises(WeightsError, match=r"MegaLoc: no weights.*\n.*\n.*`embed\.model: vlad`"):
-        create_embedder("megaloc")
-    with pytest.raises(ManifestError, match=r"Unknown embedder 'vald'.*vlad"):
-        create_embedder("vald")
-    with pytest.raises(WeightsError, match=r"no weights file .*none\.safetensors"):
-        resolve_name("auto", tmp_path / "none.safetensors")
+    for wrong, error, named in (
+        (lambda: create_embedder("megaloc"), WeightsError, r"MegaLoc: no weights.*\n.*\n.*`embed\.model: vlad`"),
+        (lambda: create_embedder("vald"), ManifestError, "Unknown embedder 'vald'.*vlad"),
+        (lambda: resolve_name("auto", tmp_path / "none.pt"), WeightsError, r"no weights file .*none\.pt"),
+    ):
+        with pytest.raises(error, match=named):
+            wrong()
     weights = tmp_path / "weights.safetensors"
     weights.write_bytes(b"some")
     assert resolve_name("auto", weights) == "megaloc"

@@ -12,7 +12,6 @@ from tests.calls import call
 from tests.rendered import write_retrieval
 from toolkit.capture import Capture, Trajectory
 from toolkit.capture.images import read_image
-from toolkit.errors import CaptureError
 from toolkit.exchange.interchange import import_colmap
 from toolkit.files import SceneFiles
 from toolkit.geometry import invert, pose_error, qt_from_pose
@@ -95,13 +94,6 @@ def test_each_camera_model_localizes_as_the_pinhole(model: str, small_capture: P
     rotation_deg, distance_m = pose_error(found, queries.world_from_cam(ground_truth=True))
     assert rotation_deg.max() < 0.1
     assert distance_m.max() < 0.01
-
-
-def test_panoramas_among_the_cameras_are_refused(small_capture: Path, tmp_path: Path) -> None:
-    write_model(tmp_path, small_capture, "PINHOLE")
-    (tmp_path / "model" / "cameras.txt").write_text("1 EQUIRECTANGULAR 640 480 640 480\n")
-    with pytest.raises(CaptureError, match="found camera model 'EQUIRECTANGULAR': cut such images into views"):
-        import_colmap(tmp_path / "model", tmp_path / "images", tmp_path / "SMALL")
 
 
 def test_every_camera_model_is_tested() -> None:

@@ -140,18 +140,19 @@ def test_there_and_back_again(model: Path, small_capture: Path, tmp_path: Path) 
 def test_nothing_is_overwritten_and_what_is_missing_is_named(
     model: Path, run: SceneFiles, small_capture: Path, tmp_path: Path
 ) -> None:
-    with pytest.raises(ManifestError, match="model: "):
-        export_colmap(run.run, run.scene, "hl", model, small_capture)
-    with pytest.raises(ManifestError, match="--capture PATH/SMALL"):
-        export_colmap(run.run, run.scene, "hl", tmp_path / "model")
-    with pytest.raises(ArtifactError, match=f"{COMMAND} run MANIFEST --only localize"):
-        export_colmap(run.run, run.scene, "ios", tmp_path / "model", small_capture)
     changed = Path(shutil.copytree(small_capture, tmp_path / small_capture.name))
     images = changed / "sessions" / "hl_map" / "images.txt"
     images.write_text("\n".join(images.read_text().splitlines()[:-1]) + "\n")
-    with pytest.raises(ArtifactError, match=r"hl_map: image hl_map/raw_data/"):
-        export_colmap(run.run, run.scene, "hl", tmp_path / "model", changed)
-    assert not (tmp_path / "model").exists()
+    new = tmp_path / "model"
+    for device, out, capture, error, named in (
+        ("hl", model, small_capture, ManifestError, "model: "),
+        ("hl", new, None, ManifestError, "--capture PATH/SMALL"),
+        ("ios", new, small_capture, ArtifactError, f"{COMMAND} run MANIFEST --only localize"),
+        ("hl", new, changed, ArtifactError, "hl_map: image hl_map/raw_data/"),
+    ):
+        with pytest.raises(error, match=named):
+            export_colmap(run.run, run.scene, device, out, capture)
+    assert not new.exists()
 
 
 def test_retrieval_becomes_a_list_of_pairs(tmp_path: Path) -> None:
@@ -171,17 +172,15 @@ def test_retrieval_becomes_a_list_of_pairs(tmp_path: Path) -> None:
     command = ["export", "pairs", str(tmp_path), "PLACE", "ios", "hl", str(tmp_path / "p.txt"), "--topk", "1"]
     assert CliRunner().invoke(app, command).exit_code == 0
     assert (tmp_path / "p.txt").read_text() == lines[0]
-    path.write_text(json.dumps(row | {"path": "PLACE/sessions/hl query/1.jpg"}))
-    with pytest.raises(ArtifactError, match=r"_query_hl\.jsonl: .*'hl query/1\.jpg'"):
-        export_pairs(tmp_path, "PLACE", "ios", "hl", tmp_path / "pairs.txt")
-    path.write_text("{}\n")
-    with pytest.raises(ArtifactError, match=r"_query_hl\.jsonl, line 1: "):
-        export_pairs(tmp_path, "PLACE", "ios", "hl", tmp_path / "pairs.txt")
-    path.write_text(json.dumps(row | {"path": "hl_query/1.jpg"}) + "\n")
-    with pytest.raises(ArtifactError, match=r"_query_hl\.jsonl: .*'hl_query/1\.jpg'"):
-        export_pairs(tmp_path, "PLACE", "ios", "hl", tmp_path / "pairs.txt")
-    with pytest.raises(ArtifactError, match=r"_map_hl_query_hl\.jsonl"):
-        export_pairs(tmp_path, "PLACE", "hl", "hl", tmp_path / "pairs.txt")
+    for device, wrong, named in (
+        ("ios", row | {"path": "PLACE/sessions/hl query/1.jpg"}, r"_query_hl\.jsonl: .*'hl query/1\.jpg'"),
+        ("ios", {}, r"_query_hl\.jsonl, line 1: "),
+        ("ios", row | {"path": "hl_query/1.jpg"}, r"_query_hl\.jsonl: .*'hl_query/1\.jpg'"),
+        ("hl", row, r"_map_hl_query_hl\.jsonl"),
+    ):
+        path.write_text(json.dumps(wrong) + "\n")
+        with pytest.raises(ArtifactError, match=named):
+            export_pairs(tmp_path, "PLACE", device, "hl", tmp_path / "pairs.txt")
 
 
 @pytest.fixture
@@ -236,10 +235,12 @@ def test_poses_and_intrinsics_are_hlocs_under_the_names_that_were_imported(
         assert [float(one) for one in params] == camera.params.tolist()
     assert export_poses(run, "PLACE", "ios", "hl", tmp_path / "p.txt", place, names="capture") == len(queries)
     assert (tmp_path / "p.txt").read_text().startswith("hl_query/raw_data/import/images/")
-    with pytest.raises(ArtifactError, match=r"_map_hl_query_hl\.txt is missing"):
-        export_poses(run, "PLACE", "hl", "hl", tmp_path / "p.txt", place)
-    with pytest.raises(ManifestError, match="names: unknown 'mine'"):
-        export_poses(run, "PLACE", "ios", "hl", tmp_path / "p.txt", place, names="mine")
+    for device, names, error, named in (
+        ("hl", "own", ArtifactError, r"_map_hl_query_hl\.txt is missing"),
+        ("ios", "mine", ManifestError, "names: unknown 'mine'"),
+    ):
+        with pytest.raises(error, match=named):
+            export_poses(run, "PLACE", device, "hl", tmp_path / "p.txt", place, names=names)
 
 
 def test_a_rig_has_a_line_for_each_of_its_cameras(small_capture: Path, tmp_path: Path) -> None:

@@ -172,15 +172,20 @@ def test_xmp_beside_the_pictures(localized: Path, placed: Path, tmp_path: Path) 
 
 
 def test_what_is_refused(localized: Path, small_capture: Path, placed: Path, tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match="no origin"):
-        geo_table(localized, small_capture)
-    with pytest.raises(ManifestError, match="geojson"):
-        export_geo(localized, tmp_path / "q.kml", placed)
-    record = placed / "sessions/ios_map/proc/import.json"
-    for origin in ([1, 2, 3], {"latitude_deg": 99, "longitude_deg": 1, "altitude_m": 1}, {"latitude_deg": 1}):
-        record.write_text(json.dumps({"origin": origin}))
-        with pytest.raises(CaptureError, match=r"import\.json: origin"):
-            origin_of(Capture.open(placed)["ios_map"])
+    def origin(found: object) -> None:
+        (placed / "sessions/ios_map/proc/import.json").write_text(json.dumps({"origin": found}))
+        origin_of(Capture.open(placed)["ios_map"])
+
+    beyond = {"latitude_deg": 99, "longitude_deg": 1, "altitude_m": 1}
+    for wrong, error, named in (
+        (lambda: geo_table(localized, small_capture), CaptureError, "no origin"),
+        (lambda: export_geo(localized, tmp_path / "q.kml", placed), ManifestError, "geojson"),
+        (lambda: origin([1, 2, 3]), CaptureError, r"import\.json: origin"),
+        (lambda: origin(beyond), CaptureError, r"import\.json: origin"),
+        (lambda: origin({"latitude_deg": 1}), CaptureError, r"import\.json: origin"),
+    ):
+        with pytest.raises(error, match=named):
+            wrong()
 
 
 @pytest.mark.slow

@@ -205,7 +205,6 @@ def test_table_of_positions(tmp_path: Path) -> None:
     table.write_text("image, x, y, z\na.jpg, 1, 2, 3.5\n")
     np.testing.assert_array_equal(read_positions(table)["a.jpg"], [1, 2, 3.5])
     table.write_text("image,x,y,z\na.jpg,1,2,3\nb.jpg,1,two,3\n")
-    with pytest.raises(CaptureError, match="line 3"):
-        read_positions(table)
-    with pytest.raises(CaptureError, match=r"missing\.csv"):
-        read_positions(tmp_path / "missing.csv")
+    for name, named in (("positions.csv", r"positions\.csv, line 3"), ("missing.csv", r"missing\.csv")):
+        with pytest.raises(CaptureError, match=named):
+            read_positions(tmp_path / name)

@@ -107,17 +107,18 @@ def test_the_matches_of_a_map_are_in_the_layout_of_hloc(run: SceneFiles, tmp_pat
         group = file["/".join(name.replace("/", "-") for name in pairs[0])]
         assert group["matches0"].shape == group["matching_scores0"].shape == (len(features[pairs[0][0]]),)
         assert group["matches0"].dtype == np.int16
-    with pytest.raises(ArtifactError, match="0 settings"):
-        export_matches(run.run, run.scene, "hl_map", "hl_map", tmp_path / "none.h5")
 
 
-def test_matches_of_several_settings_are_refused(run: SceneFiles, tmp_path: Path) -> None:
+@pytest.mark.parametrize("ratios", [(), (0.8, 0.9)])
+def test_matches_of_no_or_several_settings_are_refused(
+    ratios: tuple[float, ...], run: SceneFiles, tmp_path: Path
+) -> None:
     files = SceneFiles(tmp_path, run.scene)
     stores = [FeatureStore.of_session(run.features, "ios_map")] * 2
-    for ratio in (0.8, 0.9):
+    for ratio in ratios:
         pairs = [tuple(stores[0])[:2]]
         match_sessions(tuple(stores), pairs, MutualMatcher(ratio), files.maps, ("ios_map", "ios_map"))  # type: ignore[arg-type]
-    with pytest.raises(ArtifactError, match="2 settings"):
+    with pytest.raises(ArtifactError, match=f"{len(ratios)} settings"):
         export_matches(files.run, files.scene, "ios_map", "ios_map", tmp_path / "matches.h5")
 
 
@@ -165,20 +166,22 @@ def test_a_file_of_hloc_is_read(tmp_path: Path) -> None:
     assert store["db/1.jpg"].keypoints.dtype == np.float32
 
 
-def test_what_is_no_file_of_hloc_is_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(ArtifactError, match=r"none\.h5 cannot be read"):
-        import_features(tmp_path / "none.h5", tmp_path / "out")
+OTHER = {"numbers": np.zeros(3), "a/b/matches0": np.zeros((3, 2), int)}
+
+
+@pytest.mark.parametrize(("content", "pair", "named"), [
+    (None, None, r"other\.h5 cannot be read"),
+    (OTHER, None, "no local features"),
+    (OTHER, ("a", "b"), "not in the layout of hloc"),
+    (OTHER, ("a", "c"), "no matches of a and c"),
+    ({"a/keypoints": np.zeros((3, 2))}, None, "a is not in the layout of hloc"),
+])  # fmt: skip
+def test_what_is_no_file_of_hloc_is_refused_by_name(
+    content: dict[str, np.ndarray] | None, pair: tuple[str, str] | None, named: str, tmp_path: Path
+) -> None:
     path = tmp_path / "other.h5"
-    with h5py.File(path, "w") as file:
-        file["numbers"] = np.zeros(3)
-        file["a/b/matches0"] = np.zeros((3, 2), int)
-    with pytest.raises(ArtifactError, match="no local features"):
-        import_features(path, tmp_path / "out")
-    with pytest.raises(ArtifactError, match="not in the layout of hloc"):
-        import_matches(path, [("a", "b")], tmp_path / "out")
-    with pytest.raises(ArtifactError, match="no matches of a and c"):
-        import_matches(path, [("a", "c")], tmp_path / "out")
-    with h5py.File(path, "w") as file:
-        file["a/keypoints"] = np.zeros((3, 2))
-    with pytest.raises(ArtifactError, match="a is not in the layout of hloc"):
-        import_features(path, tmp_path / "out")
+    if content is not None:
+        with h5py.File(path, "w") as file:
+            file.update(content)
+    with pytest.raises(ArtifactError, match=named):
+        import_matches(path, [pair], tmp_path / "out") if pair else import_features(path, tmp_path / "out")

@@ -33,8 +33,6 @@ def test_the_manifest_is_the_template_with_the_capture_in_it(
     assert content["description"].startswith(f"{small_capture.name}: hl_map, ")
     assert "#   images" in path.read_text()
     assert "\n# 0 errors, " in path.read_text()
-    with pytest.raises(ManifestError, match=r"my-place\.yaml exists already"):
-        new_manifest("my-place", place)
 
 
 def test_a_capture_of_the_given_name_is_meant(
@@ -67,8 +65,11 @@ def test_without_a_capture_there_is_a_place_for_one(tmp_path: Path) -> None:
     path = new_manifest("place", folder=tmp_path)
     assert yaml.safe_load(path.read_text()) == yaml.safe_load(TEMPLATE.read_text())
     assert "cp " not in path.read_text()
-    with pytest.raises(ManifestError, match=r"not a run name"):
-        new_manifest("../place", folder=tmp_path)
-    with pytest.raises(CaptureError, match="nowhere"):
-        new_manifest("other", tmp_path / "nowhere", tmp_path)
+    for name, capture, error, named in (
+        ("place", None, ManifestError, r"place\.yaml exists already"),
+        ("../place", None, ManifestError, "not a run name"),
+        ("other", tmp_path / "nowhere", CaptureError, "nowhere"),
+    ):
+        with pytest.raises(error, match=named):
+            new_manifest(name, capture, tmp_path)
     assert not (tmp_path / "other.yaml").exists()

@@ -95,26 +95,31 @@ def test_times_and_odometry_are_those_of_the_panoramas(tmp_path: Path) -> None:
     assert session.gps["timestamp"].tolist() == [18_000_000]
 
 
-def test_what_is_refused(tmp_path: Path) -> None:
-    save_panorama(tmp_path / "photos/1.png")
-    with pytest.raises(CaptureError, match="A map needs poses"):
-        import_panoramas(tmp_path / "photos", tmp_path / "CAP", split="map")
-    save_panorama(tmp_path / "photos/1.jpg")
-    with pytest.raises(CaptureError, match="two panoramas"):
-        import_panoramas(tmp_path / "photos", tmp_path / "CAP")
+@pytest.mark.parametrize(
+    ("names", "split", "named"),
+    [(["1.png"], "map", "A map needs poses"), (["1.png", "1.jpg"], "query", "two panoramas")],
+)
+def test_what_is_refused(names: list[str], split: str, named: str, tmp_path: Path) -> None:
+    for name in names:
+        save_panorama(tmp_path / "photos" / name)
+    with pytest.raises(CaptureError, match=named):
+        import_panoramas(tmp_path / "photos", tmp_path / "CAP", split=split)
     assert not (tmp_path / "CAP").exists()
 
 
-def test_an_equirectangular_colmap_model_is_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="import panoramas"):
-        parse_camera("camera", "EQUIRECTANGULAR, 512, 256, 512, 256")
+def test_an_equirectangular_camera_is_refused_by_name(tmp_path: Path) -> None:
+    """In a camera, and in a COLMAP model."""
     save_panorama(tmp_path / "photos/1.png")
     (tmp_path / "model").mkdir()
     (tmp_path / "model/cameras.txt").write_text("1 EQUIRECTANGULAR 512 256 512 256\n")
     (tmp_path / "model/images.txt").write_text("1 1 0 0 0 0 0 0 1 1.png\n\n")
     (tmp_path / "model/points3D.txt").write_text("")
-    with pytest.raises(CaptureError, match="import panoramas"):
-        import_colmap(tmp_path / "model", tmp_path / "photos", tmp_path / "CAP")
+    for error, read in (
+        (ValueError, lambda: parse_camera("camera", "EQUIRECTANGULAR, 512, 256, 512, 256")),
+        (CaptureError, lambda: import_colmap(tmp_path / "model", tmp_path / "photos", tmp_path / "CAP")),
+    ):
+        with pytest.raises(error, match=r"model 'EQUIRECTANGULAR': cut such images into views.*import panoramas"):
+            read()
 
 
 @pytest.mark.parametrize("model", ["OPENCV_FISHEYE, 1000, 1000, 300, 300, 500, 500, 0, 0, 0, 0",

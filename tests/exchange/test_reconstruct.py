@@ -179,24 +179,24 @@ def test_a_rig_of_folders(small_capture: Path, tmp_path: Path) -> None:
         add_recording([folder], tmp_path / "PLACE", "spot")
 
 
-def test_rigs_that_are_none(photographs: Path, tmp_path: Path) -> None:
-    config = tmp_path / "rig.json"
-    single = '[{"cameras": [{"image_prefix": "a/", "ref_sensor": true}]}]'
-    for text, message in (("{", "COLMAP reads"), ('[{"cameras": 3}]', "COLMAP reads"), (single, "two cameras")):
-        config.write_text(text)
-        with pytest.raises(CaptureError, match=message):
-            reconstruct([photographs], tmp_path / "PLACE", rig=config)
-    with pytest.raises(CaptureError, match="two cameras"):
-        reconstruct([photographs], tmp_path / "PLACE", rig="folders")
+CAMERA_TABLE = "image,model,width,height,params\nother.jpg,PINHOLE,64,48,50 50 32 24\n"
 
 
-def test_tables_about_other_photographs(photographs: Path, tmp_path: Path) -> None:
-    table = tmp_path / "table.csv"
-    table.write_text("image,model,width,height,params\nother.jpg,PINHOLE,64,48,50 50 32 24\n")
-    with pytest.raises(CaptureError, match=r"table.csv.*other.jpg.*expected '000"):
-        reconstruct([photographs], tmp_path / "PLACE", table=table)
-    with pytest.raises(ManifestError, match="poses-prior"):
-        reconstruct([photographs], tmp_path / "PLACE", poses_prior=table, positions=table)
+@pytest.mark.parametrize(("content", "options", "error", "named"), [
+    ("{", ["rig"], CaptureError, "COLMAP reads"),
+    ('[{"cameras": 3}]', ["rig"], CaptureError, "COLMAP reads"),
+    ('[{"cameras": [{"image_prefix": "a/", "ref_sensor": true}]}]', ["rig"], CaptureError, "two cameras"),
+    (None, ["rig"], CaptureError, "two cameras"),
+    (CAMERA_TABLE, ["table"], CaptureError, r"given.*other.jpg.*expected '000"),
+    (CAMERA_TABLE, ["poses_prior", "positions"], ManifestError, "poses-prior"),
+])  # fmt: skip
+def test_rigs_and_tables_of_other_photographs_are_refused(
+    content: str | None, options: list[str], error: type[Exception], named: str, photographs: Path, tmp_path: Path
+) -> None:
+    given = tmp_path / "given"
+    given.write_text(content or "")
+    with pytest.raises(error, match=named):
+        reconstruct([photographs], tmp_path / "PLACE", **dict.fromkeys(options, given if content else "folders"))
 
 
 def test_two_cameras_with_one_center_do_not_bend_the_model() -> None:
@@ -252,17 +252,20 @@ def test_the_capture_is_in_the_folder_of_the_photographs(tmp_path: Path) -> None
     assert [item.name for item in gather([tmp_path], tmp_path / "PLACE/reconstruction/images")[0]] == ["a.jpg"]
 
 
-def test_nothing_fits(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("readable", "named"),
+    [(3, "fit together"), (1, r"1 photographs can be read, expected 3 or more\. 1\.png: cannot be read")],
+)
+def test_nothing_fits(readable: int, named: str, tmp_path: Path) -> None:
     photographs = tmp_path / "photographs"
     photographs.mkdir()
     rng = np.random.default_rng(0)
     for number in range(3):
         PIL.Image.fromarray(rng.integers(0, 255, (240, 320, 3), np.uint8)).save(photographs / f"{number}.png")
-    with pytest.raises(CaptureError, match="fit together"):
-        reconstruct([photographs], tmp_path / "PLACE")
-    (photographs / "0.png").unlink()
-    (photographs / "1.png").write_bytes(b"no image")
-    with pytest.raises(CaptureError, match=r"1 photographs can be read, expected 3 or more\. 1\.png: cannot be read"):
+    if readable == 1:
+        (photographs / "0.png").unlink()
+        (photographs / "1.png").write_bytes(b"no image")
+    with pytest.raises(CaptureError, match=named):
         reconstruct([photographs], tmp_path / "PLACE")
     assert not (tmp_path / "PLACE/sessions").exists()
 
@@ -327,13 +330,13 @@ def test_malformed_arguments(photographs: Path, tmp_path: Path, options: dict[st
 
 def test_sources_that_are_none(photographs: Path, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("no image")
-    for source in (tmp_path / "missing", tmp_path / "notes.txt"):
-        with pytest.raises(CaptureError, match=source.name):
-            gather([source], tmp_path / "PLACE/reconstruction/images")
-    file = photographs / "000.jpg"
-    file = file if file.exists() else next(photographs.glob("000*"))
-    with pytest.raises(CaptureError, match="one name"):
-        gather([file, file], tmp_path / "PLACE/reconstruction/images")
+    for sources, named in (
+        ([tmp_path / "missing"], "missing"),
+        ([tmp_path / "notes.txt"], "notes.txt"),
+        ([next(photographs.glob("000*"))] * 2, "one name"),
+    ):
+        with pytest.raises(CaptureError, match=named):
+            gather(sources, tmp_path / "PLACE/reconstruction/images")
 
 
 def test_other_formats_are_converted_with_their_tags(tmp_path: Path) -> None:

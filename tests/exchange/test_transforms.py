@@ -110,7 +110,7 @@ def test_the_axes_may_be_those_of_opencv_and_the_unit_not_the_meter(tmp_path: Pa
     np.testing.assert_allclose(opencv.world_from_cam()[1][:3, :3], np.array(matrix(1))[:3, :3], rtol=0, atol=1e-12)
     np.testing.assert_allclose(opencv.world_from_cam()[:, :3, 3], opengl[:, :3, 3] / 100, rtol=0, atol=1e-12)
     for options in ({"axes": "arkit"}, {"unit_m": 0.0}, {"split": "train"}, {"hold_out": 1}, {"hold_out": 4}):
-        with pytest.raises(ManifestError, match=r"Known|expected|Give"):
+        with pytest.raises(ManifestError):
             import_transforms(file, tmp_path / "C", **options)  # type: ignore[arg-type]
     assert not (tmp_path / "C").exists()
 
@@ -190,18 +190,21 @@ def test_images_that_cannot_be_used_are_rows(tmp_path: Path) -> None:
     assert "frame 5 (images/lost.jpg), transform_matrix: found [[nan" in status["images/lost.jpg"]
 
 
-def test_images_of_another_size_or_place_say_what_to_do(tmp_path: Path) -> None:
-    file = write(tmp_path, fl_x=25.0, w=SIZE[0] // 2, h=SIZE[1] // 2)
-    with pytest.raises(CaptureError, match=r"has 32 x 24; use images of the camera's size, or .* intrinsics by 2"):
-        import_transforms(file, tmp_path / "PLACE")
-    (tmp_path / "images").rename(tmp_path / "pictures")
-    with pytest.raises(CaptureError, match=r"First: images/0.jpg: no such file. Names are paths in this folder: corr"):
-        import_transforms(file, tmp_path / "PLACE")
-    elsewhere = tmp_path / "elsewhere" / "transforms.json"
-    elsewhere.parent.mkdir()
-    elsewhere.write_text(file.read_text().replace("images/", f"{tmp_path}/pictures/"))
-    with pytest.raises(CaptureError, match=r"not a path inside the folder of images. Names are paths in this folder"):
-        import_transforms(elsewhere, tmp_path / "PLACE")
+@pytest.mark.parametrize(("stored", "file", "listed", "named"), [
+    ("images", "", "images/", r"has 32 x 24; use images of the camera's size, or .* intrinsics by 2"),
+    ("pictures", "", "images/", r"First: images/0.jpg: no such file. Names are paths in this folder: corr"),
+    ("pictures", "elsewhere", "{}/pictures/", r"not a path inside the folder of images. Names are paths in this"),
+])  # fmt: skip
+def test_images_of_another_size_or_place_say_what_to_do(
+    stored: str, file: str, listed: str, named: str, tmp_path: Path
+) -> None:
+    written = write(tmp_path, fl_x=25.0, w=SIZE[0] // 2, h=SIZE[1] // 2)
+    (tmp_path / "images").rename(tmp_path / stored)
+    (tmp_path / file).mkdir(exist_ok=True)
+    path = tmp_path / file / "transforms.json"
+    path.write_text(written.read_text().replace("images/", listed.format(tmp_path)))
+    with pytest.raises(CaptureError, match=named):
+        import_transforms(path, tmp_path / "PLACE")
 
 
 def test_the_folder_of_images_may_be_a_link(tmp_path: Path) -> None:
@@ -329,9 +332,6 @@ def test_the_world_of_the_input_is_restored(tmp_path: Path) -> None:
         import_transforms(file, place, undo_applied=first)
         query = import_transforms(file, place, split="query", undo_applied=then)
         assert any(note.startswith(differ) for note in query.notes) == (first != then)
-    write(tmp_path, frames, applied_transform=[[1, 0], [0, 1]])
-    with pytest.raises(CaptureError, match="applied_transform"):
-        import_transforms(file, tmp_path / "OTHER")
 
 
 @pytest.mark.parametrize(
@@ -347,11 +347,10 @@ def test_files_of_other_tools_are_told_how_to_come(text: str, tool: str, command
     file = tmp_path / ("poses.txt" if tool == "kapture" else "poses.json")
     file.write_text(text)
     told = rf"poses.{file.suffix[1:]}: found a file of {tool}.*`{command}`"
-    with pytest.raises(CaptureError, match=told):
-        import_images(tmp_path / "images", tmp_path / "PLACE", table=file, split="map")
-    if file.suffix == ".json":
+    for door in (import_images, import_transforms) if file.suffix == ".json" else (import_images,):
+        given = {"table": file, "split": "map"} if door is import_images else {}
         with pytest.raises(CaptureError, match=told):
-            import_transforms(file, tmp_path / "PLACE")
+            door(tmp_path / "images" if given else file, tmp_path / "PLACE", **given)
 
 
 @pytest.mark.parametrize("root", ["/home/them/project/", "C:/Users/them/", "C:\\Users\\them\\"])
@@ -367,18 +366,23 @@ def test_absolute_paths_of_another_machine_are_found_by_their_ends(root: str, tm
     assert any(note.startswith("3 images have paths of another machine") for note in report.notes)
 
 
-def test_a_file_without_intrinsics_or_frames_is_refused(tmp_path: Path) -> None:
-    file = write(tmp_path)
-    content = json.loads(file.read_text())
-    file.write_text(json.dumps({"frames": content["frames"]}))
-    with pytest.raises(CaptureError, match=r"fl_x: found nothing; .* or camera_angle_x"):
+FRAMES = [{"file_path": "images/0.jpg", "transform_matrix": matrix(0)}]
+
+
+@pytest.mark.parametrize(("content", "named"), [
+    (json.dumps({"frames": FRAMES}), r"fl_x: found nothing; .* or camera_angle_x"),
+    (json.dumps(SHARED | {"frames": FRAMES, "applied_transform": [[1, 0], [0, 1]]}), "applied_transform"),
+    *(
+        (text, "an object with a list `frames`")
+        for text in ("", "{", "[]", '{"frames": []}', '{"frames": [1]}', '{"images": 1}', "[" * 100_000)
+    ),
+    (None, "cannot be read"),
+])  # fmt: skip
+def test_a_file_without_intrinsics_or_frames_is_refused(content: str | None, named: str, tmp_path: Path) -> None:
+    file = write(tmp_path, FRAMES)
+    file.unlink() if content is None else file.write_text(content)
+    with pytest.raises(CaptureError, match=named):
         import_transforms(file, tmp_path / "PLACE")
-    for text in ("", "{", "[]", '{"frames": []}', '{"frames": [1]}', '{"images": 1}', "[" * 100_000):
-        file.write_text(text)
-        with pytest.raises(CaptureError, match="an object with a list `frames`"):
-            import_transforms(file, tmp_path / "PLACE")
-    with pytest.raises(CaptureError, match="cannot be read"):
-        import_transforms(tmp_path / "nothing.json", tmp_path / "PLACE")
     assert not (tmp_path / "PLACE").exists()
 
 

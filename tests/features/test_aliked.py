@@ -129,7 +129,7 @@ def test_weights_that_are_not_finite(part: str) -> None:
 
 
 def test_weights_of_another_model() -> None:
-    with pytest.raises(WeightsError, match="not weights of ALIKED-n16"):
+    with pytest.raises(WeightsError):
         AlikedExtractor(random_state("aliked-t16"), "cpu")
 
 

@@ -222,8 +222,6 @@ def test_the_threshold(state: State, matcher: LightGlueMatcher) -> None:
     assert strict.settings != matcher.settings
     (found,) = strict.match([pair])
     np.testing.assert_array_equal(found.indices, loose.indices[loose.scores > least])
-    with pytest.raises(ManifestError, match=r"min_score is 1\.5"):
-        LightGlueMatcher(state, min_score=1.5)
 
 
 def test_other_features_are_refused(matcher: LightGlueMatcher) -> None:
@@ -232,8 +230,15 @@ def test_other_features_are_refused(matcher: LightGlueMatcher) -> None:
     for other, found in ((sift, "uint8"), (aliked, "float16")):
         with pytest.raises(ToolkitError, match=rf"superpoint, \(N, 256\).*found {found} \(5, 128\).*`mutual`"):
             matcher.match([(features(0, 5), other)])
-    with pytest.raises(ManifestError, match=r"no weights for 'sift'\. Known: superpoint, aliked"):
-        LightGlueMatcher(device="cpu", features="sift")
+
+
+@pytest.mark.parametrize(("checkpoint", "wrong", "named"), [
+    ({}, {"min_score": 1.5}, r"min_score is 1\.5"),
+    (None, {"features": "sift"}, r"no weights for 'sift'\. Known: superpoint, aliked"),
+])  # fmt: skip
+def test_wrong_settings(checkpoint: State | None, wrong: dict[str, Any], named: str) -> None:
+    with pytest.raises(ManifestError, match=named):
+        LightGlueMatcher(checkpoint, "cpu", **wrong)
 
 
 def test_weights_that_are_not_finite(state: State) -> None:

@@ -1,6 +1,5 @@
 """SuperPoint: where keypoints lie, that batches change nothing, and what is refused. Weights are random or made up."""
 
-import sys
 from typing import Any
 
 import numpy as np
@@ -9,9 +8,9 @@ import torch
 from numpy.typing import NDArray
 
 from toolkit.errors import ManifestError, ToolkitError, WeightsError
-from toolkit.features.features import LocalFeatures, create_extractor
+from toolkit.features.features import LocalFeatures
 from toolkit.features.network import SuperPointExtractor
-from toolkit.manifest import FeaturesSettings, SuperPointSettings
+from toolkit.manifest import SuperPointSettings
 
 transformers = pytest.importorskip("transformers", reason="needs the extra `learned`")
 
@@ -200,13 +199,14 @@ def test_the_fingerprint_tells_weights_and_settings_apart(extractor: SuperPointE
     assert planted(max_keypoints=9).settings != planted("bfloat16", max_keypoints=9).settings != planted().settings
 
 
-def test_wrong_settings() -> None:
-    with pytest.raises(ManifestError, match=r"'max_keypoint'.*max_keypoints"):
-        planted(max_keypoint=3)
-    with pytest.raises(ManifestError, match="max_keypoints"):
-        planted(max_keypoints=0)
-    with pytest.raises(ManifestError, match="dtype_compute is 'float8'"):
-        planted("float8")
+@pytest.mark.parametrize(("wrong", "named"), [
+    ({"max_keypoint": 3}, "'max_keypoint'.*max_keypoints"),
+    ({"max_keypoints": 0}, "max_keypoints"),
+    ({"dtype": "float8"}, "dtype_compute is 'float8'"),
+])  # fmt: skip
+def test_wrong_settings(wrong: dict[str, Any], named: str) -> None:
+    with pytest.raises(ManifestError, match=named):
+        planted(**wrong)
 
 
 @pytest.mark.parametrize("image", [np.zeros((8, 8)), np.zeros((8, 8, 4), np.uint8), np.zeros((0, 8), np.uint8)])
@@ -234,9 +234,3 @@ def test_other_weights() -> None:
     assert "1 missing: encoder.conv_blocks.0.conv_a.bias" in message
     assert "1 unexpected: extra" in message
     assert "keypoint_decoder.conv_score_b.bias found (64,)" in message
-
-
-def test_without_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(ToolkitError, match=r"transformers cannot be imported .* pip install 'transformers"):
-        create_extractor("superpoint", FeaturesSettings())

@@ -310,7 +310,7 @@ def test_a_map_is_the_same_mapped_or_read(tmp_path: Path, monkeypatch: pytest.Mo
     assert all(getattr(opened, name).flags.aligned for name in ("points", "obs_point", *ORDERS))
     assert not opened.points.flags.writeable
     (tmp_path / "map.npz").write_bytes((tmp_path / "map.npz").read_bytes()[:-200])
-    with pytest.raises(local_maps.ArtifactError, match="cannot be read"):
+    with pytest.raises(local_maps.ArtifactError):
         LocalMap.load(tmp_path / "map.npz")
 
 

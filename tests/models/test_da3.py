@@ -1,5 +1,6 @@
 """Depth Anything 3: what a small network of its kind must do, the official loader, and the official numbers."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -159,17 +160,15 @@ def test_bfloat16_stays_in_the_trunk(model: DepthAnything3, images: torch.Tensor
         assert 1e-5 < error < 0.05, name
 
 
-@pytest.mark.parametrize("shape", [(3, H, W), (1, 3, 3, H, W + 2), (2, 4, H, W), (0, 3, H, W), (1, 0, 3, H, W)])
-def test_images_of_another_shape_are_refused(model: DepthAnything3, shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"expected .*"):
-        model(torch.zeros(shape))
-
-
-def test_other_wrong_input_is_refused(model: DepthAnything3, images: torch.Tensor) -> None:
-    with pytest.raises(ValueError, match=r"patch_tokens.*\(2, 4, 13, 32\)"):
-        model(images, patch_tokens=torch.zeros(2, 4, 12, 32))
-    with pytest.raises(ValueError, match="heads"):
-        tiny(("camera",))(images, heads=("depth",))
+def test_wrong_input_is_refused(model: DepthAnything3, images: torch.Tensor) -> None:
+    shapes = [(3, H, W), (1, 3, 3, H, W + 2), (2, 4, H, W), (0, 3, H, W), (1, 0, 3, H, W)]
+    for call, named in (
+        *((partial(model, torch.zeros(shape)), "expected ") for shape in shapes),
+        (partial(model, images, patch_tokens=torch.zeros(2, 4, 12, 32)), r"patch_tokens.*\(2, 4, 13, 32\)"),
+        (partial(tiny(("camera",)), images, heads=("depth",)), "heads"),
+    ):
+        with pytest.raises(ValueError, match=named):
+            call()
 
 
 # Cameras
@@ -217,15 +216,15 @@ def test_a_checkpoint_fills_a_whole_network(monkeypatch: pytest.MonkeyPatch, tmp
     state |= {f"model.{name}": torch.zeros(1) for name in ("head.scratch.refinenet2_aux.x", "gs_head.y", "cam_enc.z")}
     torch.save(state, tmp_path / "model.pt")
     images = torch.rand(3, 3, H, W, generator=torch.Generator().manual_seed(1))
-    with pytest.raises(WeightsError, match=r"model\.pt: these are not weights of Depth Anything 3(?s:.*)mis-shaped"):
-        DepthAnything3.from_checkpoint(tmp_path / "model.pt")
     constructor = DepthAnything3.__init__
     monkeypatch.setattr(DepthAnything3, "__init__", lambda self, heads, dtype: constructor(self, heads, dtype, **TINY))
-    with pytest.raises(WeightsError, match=r"1 unexpected: backbone\.mask_token"):
-        DepthAnything3.from_checkpoint({**state, "model.backbone.mask_token": torch.zeros(1)})
     lacking = {key: value for key, value in state.items() if not key.endswith("blocks.2.attn.q_norm.weight")}
-    with pytest.raises(WeightsError, match=r"1 missing: backbone\.pretrained\.blocks\.2\.attn\.q_norm\.weight"):
-        DepthAnything3.from_checkpoint(lacking)
+    for wrong, named in (
+        ({**state, "model.backbone.mask_token": torch.zeros(1)}, r"1 unexpected: backbone\.mask_token"),
+        (lacking, r"1 missing: backbone\.pretrained\.blocks\.2\.attn\.q_norm\.weight"),
+    ):
+        with pytest.raises(WeightsError, match=named):
+            DepthAnything3.from_checkpoint(wrong)
     model = DepthAnything3.from_checkpoint(tmp_path / "model.pt")
     assert not model.training
     assert not any(value.is_meta for value in [*model.parameters(), *model.buffers()])
@@ -246,10 +245,15 @@ def test_the_size_is_read_off_the_official_keys(size: str, channels: int) -> Non
     assert len(left_out) == 164
 
 
-def test_another_size_is_refused() -> None:
-    state = {"model.backbone.pretrained.camera_token": torch.zeros(1, 2, 1024)}
-    with pytest.raises(WeightsError, match=r"camera_token found \(1, 2, 1024\) .*, expected \(1, 2, 768\)"):
-        DepthAnything3.from_checkpoint(state)
+def test_another_size_is_refused(tmp_path: Path) -> None:
+    torch.save({f"model.{name}": value for name, value in tiny().state_dict().items()}, tmp_path / "model.pt")
+    token = {"model.backbone.pretrained.camera_token": torch.zeros(1, 2, 1024)}
+    for given, named in (
+        (tmp_path / "model.pt", r"model\.pt: these are not weights of Depth Anything 3(?s:.*)mis-shaped"),
+        (token, r"camera_token found \(1, 2, 1024\) .*, expected \(1, 2, 768\)"),
+    ):
+        with pytest.raises(WeightsError, match=named):
+            DepthAnything3.from_checkpoint(given)
 
 
 # Images
@@ -287,15 +291,15 @@ def test_sizes_of_images(size: tuple[int, int], shown: tuple[int, int]) -> None:
     assert images.shape == (1, 3, shown[1], shown[0])
 
 
-def test_wrong_images_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ImageError, match=r"none\.png"):
-        load_images([tmp_path / "none.png"])
-    with pytest.raises(ImageError, match=r"1000 x 10 pixels is too elongated.*no\. 0"):
-        load_images([np.zeros((10, 1000, 3), np.uint8)])
-    with pytest.raises(ValueError, match="no images"):
-        load_images([])
-    with pytest.raises(ValueError, match=r"crop.*upper_bound_resize"):
-        load_images([np.zeros((10, 10, 3), np.uint8)], "crop")
+@pytest.mark.parametrize(("images", "mode", "error", "named"), [
+    (["none.png"], [], ImageError, r"none\.png"),
+    ([np.zeros((10, 1000, 3), np.uint8)], [], ImageError, r"1000 x 10 pixels is too elongated.*no\. 0"),
+    ([], [], ValueError, "no images"),
+    ([np.zeros((10, 10, 3), np.uint8)], ["crop"], ValueError, r"crop.*upper_bound_resize"),
+])  # fmt: skip
+def test_wrong_images_are_refused(images: list[Any], mode: list[str], error: type[Exception], named: str) -> None:
+    with pytest.raises(error, match=named):
+        load_images(images, *mode)
 
 
 # The official numbers

@@ -139,8 +139,13 @@ def test_names_of_the_hub(state: State) -> None:
     matcher = LightGlueMatcher(hub, "cpu", features="aliked")
     assert matcher.settings == LightGlueMatcher(state, "cpu", features="aliked").settings
     hub["transformer_layers.3.cross_attention.k_proj.bias"] = across + 1
-    with pytest.raises(WeightsError, match=r"1 unexpected: .*3\.cross_attention\.k_proj\.bias"):
-        LightGlueMatcher(hub, "cpu", features="aliked")
+    assert state["posenc.Wr.weight"].shape == (DIM // 8, 2)
+    for given, features, named in (
+        (hub, "aliked", r"1 unexpected: .*3\.cross_attention\.k_proj\.bias"),
+        (state, "superpoint", r"2 unexpected: input_proj\.weight"),  # those of another kind
+    ):
+        with pytest.raises(WeightsError, match=named):
+            LightGlueMatcher(given, "cpu", features=features)
 
 
 def test_loaded_tensors_are_not_changed(state: State) -> None:
@@ -159,9 +164,3 @@ def test_padding_and_the_products_of_torch_change_nothing(network: LightGlue, mo
     for partners, scores in (padded, run(network, (300, 41))):
         assert torch.equal(partners, expected[0])
         torch.testing.assert_close(scores, expected[1], rtol=1e-4, atol=1e-6)
-
-
-def test_other_kinds_weights_are_refused(state: State) -> None:
-    with pytest.raises(WeightsError, match=r"2 unexpected: input_proj\.weight"):
-        LightGlueMatcher(state, "cpu")
-    assert state["posenc.Wr.weight"].shape == (DIM // 8, 2)

@@ -71,9 +71,7 @@ def test_the_covariance_is_that_of_the_rig(world: World) -> None:
     (near,) = answers_of(localizer, [(query, references)])
     rig_from_cam = geometry.make_pose(np.eye(3), [10.0, 0.0, 0.0])[None]
     (far,) = answers_of(localizer, [(replace(query, rig_from_cams=rig_from_cam), references)])
-    np.testing.assert_allclose(
-        far.estimate.world_from_rig @ rig_from_cam[0], near.estimate.world_from_rig, atol=1e-9
-    )
+    np.testing.assert_allclose(far.estimate.world_from_rig @ rig_from_cam[0], near.estimate.world_from_rig, atol=1e-9)
     assert np.isclose(far.estimate.rotation_std_deg, near.estimate.rotation_std_deg)
     arm_m = 10 * np.radians(near.estimate.rotation_std_deg) * np.sqrt(2 / 3)
     assert abs(far.estimate.position_std / np.hypot(arm_m, near.estimate.position_std) - 1) < 0.2
@@ -353,10 +351,12 @@ def test_the_log_says_that_it_is_simulated(
 def test_the_network_is_never_replaced_by_the_simulation(
     run: SceneFiles, small_capture: Path, method: str, no_hub: None
 ) -> None:
-    with pytest.raises(WeightsError, match=r"(?s)VGGT-1B.*localize\.predictor\.checkpoint.*localize\.method: pnp"):
-        run_stage(small_capture, run, method=method, predictor={"name": "vggt"})
-    with pytest.raises(WeightsError, match=r"nowhere\.pt"):
-        run_stage(small_capture, run, method=method, predictor={"name": "vggt", "checkpoint": "nowhere.pt"})
+    for given, named in (
+        ({}, r"(?s)VGGT-1B.*localize\.predictor\.checkpoint.*localize\.method: pnp"),
+        ({"checkpoint": "nowhere.pt"}, r"nowhere\.pt"),
+    ):
+        with pytest.raises(WeightsError, match=named):
+            run_stage(small_capture, run, method=method, predictor={"name": "vggt"} | given)
     assert not run.poses_dir.exists()
 
 
@@ -486,7 +486,7 @@ class Refuses:
 
 def test_wrong_weights_end_the_run_and_a_bad_image_does_not(world: World) -> None:
     queries, _ = world.queries("ios")
-    with pytest.raises(WeightsError, match="of another network"):
+    with pytest.raises(WeightsError):
         world.localizer(Refuses(WeightsError("of another network"))).predict(queries)
     answers = answers_of(world.localizer(Refuses(ImageError("torn.jpg"))), queries)
     assert {answer.estimate.status_text for answer in answers} == {"failed: ImageError: torn.jpg"}

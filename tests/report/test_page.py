@@ -57,15 +57,11 @@ def full(tmp_path):
     recall.to_csv(files.evaluation / "recall.csv", index=False)
     write_sidecar(files.evaluation / "recall.csv", {"messages": ["spot <spot>: no poses file."]})
     losses = (
-        recall[["map_device", "query_device", "state", "queries"]]
-        .iloc[:8]
-        .assign(threshold="(1deg,0.1m)", missed=4)
+        recall[["map_device", "query_device", "state", "queries"]].iloc[:8].assign(threshold="(1deg,0.1m)", missed=4)
     )
     losses = losses.assign(**{"no good reference": 1, "no pose": 2, "wrong pose": 1})
     losses.to_csv(files.evaluation / "losses.csv", index=False)
-    retrieval = recall[["map_device", "query_device", "state", "queries"]].assign(
-        radius_m=8.0, angle_deg=45.0
-    )
+    retrieval = recall[["map_device", "query_device", "state", "queries"]].assign(radius_m=8.0, angle_deg=45.0)
     retrieval.assign(**{"recall@1": 0.77, "recall@10": 1.0, "in_map": 1.0}).to_csv(
         files.evaluation / "retrieval.csv", index=False
     )
@@ -196,9 +192,7 @@ def test_large_pictures_are_reduced_and_the_page_is_bounded(full, monkeypatch):
 def test_minimal_and_failed_run(tmp_path):
     page = write_report(write_run(tmp_path / "a")).read_text()
     assert "<h1>a</h1>" in page
-    run = write_run(
-        tmp_path / "b", name="b", status="failed", error="NameError: <x>", stages=[{"scene": "S"}]
-    )
+    run = write_run(tmp_path / "b", name="b", status="failed", error="NameError: <x>", stages=[{"scene": "S"}])
     text = text_of(write_report(run).read_text())
     assert "This run stopped before its end. NameError: &lt;x&gt;" in text
     assert "S Not evaluated." in text
@@ -286,11 +280,11 @@ def test_unreadable_picture_is_named(full):
     assert "scene_ios.png cannot be read" in write_report(full).read_text()
 
 
-def test_torn_or_missing_run_is_an_error_that_says_so(tmp_path):
-    with pytest.raises(ArtifactError, match=r"run.json is missing"):
-        write_report(tmp_path)
-    (tmp_path / "run.json").write_text('{"name": ')
-    with pytest.raises(ArtifactError, match="not valid JSON"):
+@pytest.mark.parametrize(("content", "named"), [(None, r"run\.json is missing"), ('{"name": ', "not valid JSON")])
+def test_torn_or_missing_run_is_an_error_that_says_so(tmp_path, content, named):
+    if content:
+        (tmp_path / "run.json").write_text(content)
+    with pytest.raises(ArtifactError, match=named):
         write_report(tmp_path)
 
 

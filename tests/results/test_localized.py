@@ -139,22 +139,17 @@ def test_a_query_that_the_stage_could_not_begin_has_its_images(capture, open_pai
     assert not len(camera.pixels)
 
 
-def test_poses_without_their_correspondences_are_an_error(capture, tmp_path):
-    stem = write_pair(capture, tmp_path, "ios", "ios", [stored()])
-    stem.with_name(f"{stem.name}.h5").unlink()
-    with pytest.raises(ArtifactError, match=r"\.h5"):
-        LocalizedPair.open(capture, "ios", "ios", tmp_path, None)
-
-
-@pytest.mark.parametrize("suffix", ["txt", "csv"])
-def test_files_of_a_run_that_were_cut_off_are_an_error(capture, tmp_path, suffix):
+@pytest.mark.parametrize(("suffix", "why"), [("txt", " is damaged"), ("csv", " is damaged"), ("h5", "")])
+def test_files_of_a_run_that_were_cut_off_or_removed_are_an_error(capture, tmp_path, suffix, why):
     stem = write_pair(capture, tmp_path, "ios", "ios", [stored(), stored()])
-    poses, table = (stem.with_name(f"{stem.name}.{end}") for end in ("txt", "csv"))
+    poses, table, torn = (stem.with_name(f"{stem.name}.{end}") for end in ("txt", "csv", suffix))
     write_sidecar(poses, {}, [table])
     assert len(LocalizedPair.open(capture, "ios", "ios", tmp_path, None).results.table) == 2
-    torn = stem.with_name(f"{stem.name}.{suffix}")
-    torn.write_text("".join(torn.read_text().splitlines(True)[:-1]))
-    with pytest.raises(ArtifactError, match=rf"\.{suffix} is damaged"):
+    if suffix == "h5":
+        torn.unlink()
+    else:
+        torn.write_text("".join(torn.read_text().splitlines(True)[:-1]))
+    with pytest.raises(ArtifactError, match=rf"\.{suffix}{why}"):
         LocalizedPair.open(capture, "ios", "ios", tmp_path, None)
 
 

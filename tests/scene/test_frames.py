@@ -109,10 +109,9 @@ def test_a_loss_of_tracking_that_pictures_tell(answering: Any) -> None:
 def test_frames_and_cameras_that_do_not_fit_are_refused(answering: Any) -> None:
     way = drive(np.random.default_rng(2))
     answering(way)
-    with pytest.raises(ValueError, match="39 images and 40 poses"):
-        localize_sequence(PLACE, pictures_of(way)[1:], CAMERA, way.odometry)
-    with pytest.raises(ValueError, match="3 cameras and 40 images"):
-        localize_sequence(PLACE, pictures_of(way), [CAMERA] * 3, way.odometry)
+    for first, cameras, named in ((1, CAMERA, "39 images and 40 poses"), (0, [CAMERA] * 3, "3 cameras and 40 images")):
+        with pytest.raises(ValueError, match=named):
+            localize_sequence(PLACE, pictures_of(way)[first:], cameras, way.odometry)
     localize_sequence(PLACE, pictures_of(way), [CAMERA] * 40, way.odometry)
 
 
@@ -134,10 +133,12 @@ def test_a_camera_that_does_not_fit_its_picture_is_an_error_unlike_an_unreadable
     sift = LocalMethod("sift", SiftExtractor(), MutualMatcher())
     scene_map = Map("ios", Path("sessions"), Path("maps"), LocalizeSettings(), [sift])
     odometry = Odometry(np.zeros(1, np.int64), np.eye(4)[None])
-    with pytest.raises(CameraError, match=message):
-        localize_sequence(scene_map, [picture], cameras, odometry, None, rig_from_cams)
-    with pytest.raises(CameraError, match=message):
-        SequenceLocalizer(scene_map, None, rig_from_cams).add(0, np.eye(4), picture, cameras)
+    for door in (
+        lambda: localize_sequence(scene_map, [picture], cameras, odometry, None, rig_from_cams),
+        lambda: SequenceLocalizer(scene_map, None, rig_from_cams).add(0, np.eye(4), picture, cameras),
+    ):
+        with pytest.raises(CameraError, match=message):
+            door()
     done = localize_sequence(scene_map, ["nowhere.jpg"], CAMERA, odometry)
     assert done.single[0].status_text == "failed: Image not found: nowhere.jpg"
     localizer = SequenceLocalizer(scene_map)
@@ -150,7 +151,7 @@ def test_a_frame_can_be_added_again_after_an_error(monkeypatch: pytest.MonkeyPat
     found = QueryResult(Status.OK, "", np.eye(4), SURE, p_correct=0.99)
     monkeypatch.setattr(frames, "localize_image", Mock(side_effect=[CameraError("another size"), found, found]))
     localizer = SequenceLocalizer(PLACE)
-    with pytest.raises(CameraError, match="another size"):
+    with pytest.raises(CameraError):
         localizer.add(5, np.eye(4), 0, CAMERA)
     assert localizer.single is None
     for timestamp in (5, 6):
@@ -232,7 +233,9 @@ def test_frames_come_in_the_order_of_time(answering: Any) -> None:
     answering(drive(np.random.default_rng(7)))
     localizer = SequenceLocalizer(PLACE)
     localizer.add(1_000_000, np.eye(4))
-    with pytest.raises(ValueError, match="1000000"):
-        localizer.add(1_000_000, np.eye(4))
-    with pytest.raises(ValueError, match="odom_from_rig"):
-        localizer.add(2_000_000, np.full((4, 4), np.nan))
+    for timestamp, pose, named in (
+        (1_000_000, np.eye(4), "1000000"),
+        (2_000_000, np.full((4, 4), np.nan), "odom_from_rig"),
+    ):
+        with pytest.raises(ValueError, match=named):
+            localizer.add(timestamp, pose)

@@ -118,14 +118,14 @@ def test_unchanged_settings_give_the_same_pose_and_others_are_shown_beside(pair:
     alone = text_of(nearest.after.figure)
     assert "true position error" in alone
     assert not any(text in alone for text in ("inliers", "descriptor matches", "image covered")), "it has none"
-    with pytest.raises(ManifestError, match=r"^localize: unknown key 'pnp.min_inlier'. Did you mean 'min_inliers'"):
-        one.result.what_if({"localize.pnp.min_inlier": 5})
-    with pytest.raises(ManifestError, match=r"--set localize.unit"):
-        one.result.what_if({"localize.unit": None})
-    with pytest.raises(ManifestError, match=r"embed.*retrieve.topk"):
-        one.result.what_if({"embed.models": "vlad"})
-    with pytest.raises(ManifestError, match=r"topk"):
-        one.result.what_if({"retrieve.topk": 0})
+    for key, value, named in (
+        ("localize.pnp.min_inlier", 5, "^localize: unknown key 'pnp.min_inlier'. Did you mean 'min_inliers'"),
+        ("localize.unit", None, "--set localize.unit"),
+        ("embed.models", "vlad", "embed.*retrieve.topk"),
+        ("retrieve.topk", 0, "topk"),
+    ):
+        with pytest.raises(ManifestError, match=named):
+            one.result.what_if({key: value})
 
 
 def test_the_worst_is_the_worst(small_capture: Path, tmp_path: Path) -> None:
@@ -236,18 +236,17 @@ def test_names_and_numbers_that_are_none_are_refused(files: SceneFiles, pair: In
     name = pair.localized.query_session.image_name(int(pair.localized.rows[2][-1]))
     for same in (name, name.partition("raw_data/")[2], f"SMALL/sessions/{name}"):
         assert pair.look(same).number == 2
-    with pytest.raises(ArtifactError, match=f"The nearest of its .* images is '{name}'"):
-        pair.look(name.replace("raw_data", "raw_dat"))
-    with pytest.raises(ArtifactError, match=f"expected a number from 0 to {len(pair) - 1}"):
-        pair.look(len(pair))
-    with pytest.raises(ArtifactError, match=r"expected a number or the name of an image"):
-        pair.look(1.5)  # type: ignore[arg-type]
-    with pytest.raises(ArtifactError, match="2 have an image name that ends in"):
-        find_query("b.jpg", {"x/b.jpg": 0, "y/b.jpg": 1, "y/ab.jpg": 2}, 3)
-    with pytest.raises(ArtifactError, match=r"no correspondences of queries of 'spt'.*Did you mean .*spot"):
-        InspectedPair("ios", "spt", files.poses_dir)
-    with pytest.raises(ArtifactError, match="no correspondences"):
-        InspectedPair("ios", "spot", tmp_path)
+    alike = {"x/b.jpg": 0, "y/b.jpg": 1, "y/ab.jpg": 2}
+    for ask, named in (
+        (lambda: pair.look(name.replace("raw_data", "raw_dat")), f"The nearest of its .* images is '{name}'"),
+        (lambda: pair.look(len(pair)), f"expected a number from 0 to {len(pair) - 1}"),
+        (lambda: pair.look(1.5), "expected a number or the name of an image"),
+        (lambda: find_query("b.jpg", alike, 3), "2 have an image name that ends in"),
+        (lambda: InspectedPair("ios", "spt", files.poses_dir), "no correspondences .*'spt'.*Did you mean .*spot"),
+        (lambda: InspectedPair("ios", "spot", tmp_path), "no correspondences"),
+    ):
+        with pytest.raises(ArtifactError, match=named):
+            ask()
 
 
 def test_an_estimate_in_doubt_says_why() -> None:
@@ -300,9 +299,7 @@ def test_a_list_chooses_what_is_shown(pair: InspectedPair, monkeypatch: pytest.M
     assert [type(shown).__name__ for shown in outputs] == ["Answer"]
 
 
-def test_asking_in_a_notebook_does_not_end_it(
-    capsys: pytest.CaptureFixture[str], pair: InspectedPair
-) -> None:
+def test_asking_in_a_notebook_does_not_end_it(capsys: pytest.CaptureFixture[str], pair: InspectedPair) -> None:
     Choice(pair.look(0)).attempt(lambda query: query.result.what_if({"localize.unit": None}))
     assert "unit" in capsys.readouterr().out
     Choice(None).attempt(lambda query: pytest.fail("there is none"))

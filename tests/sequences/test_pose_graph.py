@@ -1,6 +1,5 @@
 """The pose graph of odometry and single queries."""
 
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 
 from tests.sequences.drifting import drive, small_motion
 from toolkit import geometry
-from toolkit.errors import ManifestError
 from toolkit.manifest import SequenceSettings
 from toolkit.pose.base import Status
 from toolkit.sequences.odometry import Odometry, PosedQueries, with_measured_drift
@@ -158,10 +156,3 @@ def test_online_poses_rest_on_so_many_seconds() -> None:
     assert not np.allclose(placed.world_from_rig[5], again.world_from_rig[5])
     late = place_online(way.odometry, way.queries.choose(way.queries.frames < 15), asked, short)
     assert late.status[30].startswith("failed")
-
-
-def test_without_gtsam_one_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "gtsam", None)
-    way = drive(np.random.default_rng(6))
-    with pytest.raises(ManifestError, match="pip install"):
-        place_piece(way.odometry, way.queries, SETTINGS)

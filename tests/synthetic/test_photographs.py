@@ -92,20 +92,20 @@ def test_the_same_seed_gives_the_same_bytes(scene: Path, arranged: dict[bool, Pa
     assert [path.read_bytes() for path in files[0]] != [path.read_bytes() for path in files[1]]
 
 
-def test_what_is_no_scene_is_refused(scene: Path, tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match=r"wal.*Did you mean 'wall'"):
-        arrange(scene, tmp_path / "WALL", ("wal",))
+@pytest.mark.parametrize(("asked", "broken", "out", "named"), [
+    ("wal", "", "WALL", "wal.*Did you mean 'wall'"),
+    ("wall", "gt_dense_cameras/0000.jpg.camera", "WALL", r"0000\.jpg\.camera"),
+    ("wall", "images/0000.jpg", "WALL", r"0000\.jpg: no such image"),
+    ("wall", "", "full", "full"),
+])  # fmt: skip
+def test_what_is_no_scene_is_refused(asked: str, broken: str, out: str, named: str, tmp_path: Path) -> None:
     write_scene(tmp_path / "scenes" / "wall", 1)
-    file = tmp_path / "scenes" / "wall" / "gt_dense_cameras" / "0000.jpg.camera"
-    file.write_text("1 2 3\n")
-    with pytest.raises(CaptureError, match=r"0000\.jpg\.camera"):
-        arrange(tmp_path / "scenes", tmp_path / "WALL", ("wall",))
-    write_scene(tmp_path / "scenes" / "wall", 1)
-    (tmp_path / "scenes" / "wall" / "images" / "0000.jpg").unlink()
-    with pytest.raises(CaptureError, match=r"0000\.jpg: no such image"):
-        arrange(tmp_path / "scenes", tmp_path / "WALL", ("wall",))
-    assert not (tmp_path / "WALL").exists()
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").touch()
-    with pytest.raises(CaptureError, match="full"):
-        arrange(scene, tmp_path / "full", ("wall",))
+    if broken.endswith(".camera"):
+        (tmp_path / "scenes" / "wall" / broken).write_text("1 2 3\n")
+    elif broken:
+        (tmp_path / "scenes" / "wall" / broken).unlink()
+    with pytest.raises(CaptureError, match=named):
+        arrange(tmp_path / "scenes", tmp_path / out, (asked,))
+    assert not (tmp_path / "WALL").exists()

@@ -126,9 +126,7 @@ def map_dir(tmp_path_factory):
     observed = np.array([0, 1, 0, 1, 0, 2])  # point 0 is seen by three, the others by fewer
     poses = np.tile(np.eye(4), (3, 1, 1))
     keypoints, noise_px = np.arange(6), np.ones(3, np.float32)
-    local_map = LocalMap(
-        ["a", "b", "c"], [camera] * 3, poses, points, colors, images, keypoints, observed, noise_px
-    )
+    local_map = LocalMap(["a", "b", "c"], [camera] * 3, poses, points, colors, images, keypoints, observed, noise_px)
     local_map.save(folder / "hl_map-superpoint.npz")
     return folder
 
@@ -239,12 +237,13 @@ def test_queries_stand_where_a_trajectories_file_says(capture, map_dir, tmp_path
 
 
 def test_wrong_choices_are_named(capture, tmp_path):
-    with pytest.raises(CaptureError, match="no subsession 'dusk'; known: morning, noon, all"):
-        record_session(capture, "map", "hl", "dusk", out=tmp_path / "x.rrd")
-    with pytest.raises(CaptureError, match="every=0"):
-        record_session(capture, "map", "hl", every=0, out=tmp_path / "x.rrd")
-    with pytest.raises(ArtifactError, match="queries_pose"):
-        record_session(capture, "map", "hl", vis_retrieve_queries=True, out=tmp_path / "x.rrd")
+    for given, options, error, named in (
+        (["dusk"], {}, CaptureError, "no subsession 'dusk'; known: morning, noon, all"),
+        ([], {"every": 0}, CaptureError, "every=0"),
+        ([], {"vis_retrieve_queries": True}, ArtifactError, "queries_pose"),
+    ):
+        with pytest.raises(error, match=named):
+            record_session(capture, "map", "hl", *given, out=tmp_path / "x.rrd", **options)
     assert not list(tmp_path.iterdir())
 
 
