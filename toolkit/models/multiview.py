@@ -265,12 +265,13 @@ class Loader:
             borders = ([width, height] - fitted) // 2
         return Layout(mode, (height, width), scales, offsets + borders)
 
-    def load(self, sources: Sequence[Source], mode: str) -> Views:
-        """Load images. Blends RGBA with white. Does not apply the EXIF orientation.
+    def load(self, sources: Sequence[Source], mode: str | None = None) -> Views:
+        """Load images; None: in the first mode. Blends RGBA with white. Does not apply the EXIF orientation.
 
         Raise ImageError for a file that cannot be decoded or an elongated image; ValueError for no images or another
         mode.
         """
+        mode = self.modes[0] if mode is None else mode
         if mode not in self.modes:
             raise ValueError(f"mode is {mode!r}; expected one of {list(self.modes)}.")
         if not len(sources):
@@ -378,15 +379,14 @@ class MultiView(nn.Module):
     class_tokens: ClassVar[int] = 0
     """Number of tokens that `encode` returns before the patches of an image."""
     aggregator: Any
-    """The trunk: `patch_embed` encodes patches, `camera_token` is a parameter (..., C)."""
+    """The trunk: `patch_embed` encodes patches."""
 
-    def __init__(self, heads: Sequence[str], compute_dtype: torch.dtype) -> None:
-        """The heads are those to create, of `known_heads`, else raise ValueError; `compute_dtype`, float32 or bfloat16,
-        is for the trunk's matrix products and attention. Sums, norms and heads are float32.
+    def __init__(self, heads: Sequence[str], channels: int, dense_layers: Sequence[int]) -> None:
+        """The heads are those to create, of `known_heads`, else raise ValueError; `channels` are those of a token,
+        `dense_layers` the four layers that dense heads read.
         """
         super().__init__()
-        self.heads = _ordered_heads(heads, self.known_heads)
-        self.compute_dtype = compute_dtype
+        self.heads, self.channels, self.dense_layers = _ordered_heads(heads, self.known_heads), channels, dense_layers
 
     @classmethod
     def from_checkpoint(
@@ -401,14 +401,16 @@ class MultiView(nn.Module):
             checkpoint: the official file, `.pt` or `.safetensors`, or its tensors by name (shared, not copied, if
                 their data type stays).
             heads: the heads to create; None: all.
-            compute_dtype: as for the constructor. bfloat16 halves the memory of the weights.
+            compute_dtype: of the trunk's matrix products and attention, float32 or bfloat16, which halves the memory of
+                the weights. Sums, norms and heads are float32.
 
         Raises:
             WeightsError: no checkpoint, or one of another model; names missing, unexpected, mis-shaped keys.
             ValueError: unknown head.
         """
+        network: Any = cls  # takes other arguments than this base
         with torch.device("meta"):
-            model = cls(cls.known_heads if heads is None else heads, compute_dtype, **cls._sizes(checkpoint))
+            model: Self = network(cls.known_heads if heads is None else heads, compute_dtype, **cls._sizes(checkpoint))
         other_heads = (prefix for head, prefix in cls.prefixes.items() if head not in model.heads)
         load_checkpoint(model, checkpoint, cls.title, ignore=(*cls.unused, *other_heads))
         return model
@@ -417,11 +419,6 @@ class MultiView(nn.Module):
     def _sizes(cls, checkpoint: str | Path | Mapping[str, Tensor]) -> dict[str, Any]:
         """Return the constructor arguments in which the official checkpoints differ."""
         return {}
-
-    @property
-    def channels(self) -> int:
-        """Channels of a token."""
-        return int(self.aggregator.camera_token.shape[-1])
 
     @torch.no_grad()
     def encode(self, images: Tensor) -> Tensor:
