@@ -246,15 +246,7 @@ class _Model:
 
     def _open_embedder(self) -> Embedder:
         (name,), settings = self.settings.models, self.settings
-        if name == "vlad":
-            return create_embedder(name, vocabulary=self._vocabulary())
-        return create_embedder(
-            name,
-            checkpoint=settings.checkpoint,
-            device=settings.compute_device,
-            dtype_compute=settings.dtype_compute,
-            image_size=settings.image_size,
-        )
+        return create_embedder(name, **({"vocabulary": self._vocabulary()} if name == "vlad" else settings.of_network))
 
     def _vocabulary(self) -> Path:
         """Learn the VLAD vocabulary from the map images of all devices, unless the file is current."""

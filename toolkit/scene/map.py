@@ -79,8 +79,6 @@ from toolkit.scene.query import MapCameras, answer_of, query_from, show_matches,
 from toolkit.threads import fixed_sums
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from toolkit.figures.answers import Answer, Comparison
     from toolkit.viewer.queries import View3D
 
@@ -280,18 +278,7 @@ class Map:
         """
         return (localizer or self.localizer).match(self._with_features(query).scaled(1 / self.length), references)
 
-    def show_matches(self, matches: QueryMatches, reference: int = 1, image: int = 0) -> "Figure":
-        """Draw the matches by descriptors of one image of a query with one of its references.
-
-        Args:
-            matches: what `match` returned.
-            reference: rank of the reference, from 1.
-            image: number of the query image, from 0.
-
-        Raises:
-            ArtifactError: there is no such image or reference, or the method does not match keypoints.
-        """
-        return show_matches(self, matches, reference, image)
+    show_matches = show_matches
 
     def show_3d(self) -> "View3D":
         """Return the map in 3D: points and cameras; see `QueryResult.show_3d`."""
@@ -413,7 +400,8 @@ class Map:
         `first` is the latest result. `found_by` names the fallback features if the pose was computed with them.
         """
         poses = [first.world_from_rig, *(rival.world_from_rig for rival in first.rivals)]
-        known = [_canonical(pose) for pose in poses[:MAX_KNOWN] if pose is not None]
+        # As read from a file, so that results do not depend on whether the poses were stored.
+        known = [geometry.pose_from_qt(geometry.qt_from_pose(pose)) for pose in poses[:MAX_KNOWN] if pose is not None]
         # The earlier poses are judged by all kinds of features.
         known_priors = [
             Prior(pose, images, SEARCH_DEG[0], "first") for pose in known if len(images := self._images_near(pose))
@@ -534,10 +522,9 @@ class Map:
         if self._unmapped and not settings.predicts:
             return self._on_demand_localizer(self._unmapped)
         if not self.mapped:
-            fault = (
-                f"The map of {self.device!r} was built for another method than {settings.method!r} and has no points"
-            )
-            raise ArtifactError(f"{fault}, which it needs. Localize with {settings.method!r} first.")
+            fault = f"The map of {self.device!r} was built for another method than {settings.method!r}"
+            do = f"Localize with {settings.method!r} first."
+            raise ArtifactError(f"{fault} and has no points, which it needs. {do}")
         pnp = PnpLocalizer(self.in_lengths, settings.pnp, settings.seed)
         if settings.method != "feed_forward":
             for kind in self.in_lengths:
@@ -681,11 +668,6 @@ class Map:
         depth = self.length * NOMINAL_DEPTH if self.settings.unit is None else None
         unit = {"unit": self.settings.unit, "depth": depth, "length": self.length}
         return {**unit, "text": self.remarks, **asdict(self.consistency)}
-
-
-def _canonical(pose: Floats) -> Floats:
-    """Return a pose (4, 4) as it is read from a file, so that results do not depend on whether it was stored."""
-    return geometry.pose_from_qt(geometry.qt_from_pose(pose))
 
 
 # The references of a query, and what its results need
@@ -858,14 +840,8 @@ class ReferenceSearch:
         """The embedders that the run used; ArtifactError is raised if the map's vectors are from another one."""
         settings = self.embed_settings
         folders = embedding_folders(self.files.embeddings).values()
-        learned = {
-            "checkpoint": settings.checkpoint,
-            "device": settings.compute_device,
-            "dtype_compute": settings.dtype_compute,
-            "image_size": settings.image_size,
-        }
         embedders = [
-            create_embedder(name, **({"vocabulary": folder / "vlad.npz"} if name == "vlad" else learned))
+            create_embedder(name, **({"vocabulary": folder / "vlad.npz"} if name == "vlad" else settings.of_network))
             for name, folder in zip(settings.models, folders, strict=True)
         ]
         for embedder, vectors in zip(embedders, self._stored[0].parts.values(), strict=True):
