@@ -661,8 +661,6 @@ def _backend(
         raise ValueError(f"Unknown backend {backend!r}; expected faiss or torch.")
     if backend == "torch" or len(dims) > 1 or masks is not None:
         return _torch_backend(query, masks, compute_device, dims)
-    import faiss
-
     if not faiss_gpu:
         return lambda block, _, number: faiss.knn(query, block, number, metric=faiss.METRIC_INNER_PRODUCT)
     if not hasattr(faiss, "StandardGpuResources"):

@@ -19,7 +19,7 @@ from toolkit.capture.images import thumbnails, turn_image
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_folders, open_descriptors, shows_upright
 from toolkit.embedders.masks import near as within
-from toolkit.embedders.search import VectorIndex, embedder_fingerprint, fuse, load_index, search
+from toolkit.embedders.search import VectorIndex, embedder_fingerprint, load_index, search
 from toolkit.errors import ArtifactError
 from toolkit.features.features import KINDS, SiftExtractor, usable
 from toolkit.features.matching import (
@@ -96,8 +96,8 @@ FEW_REFERENCES = 4
 """How many references, those that support an `ok` pose most, fallback features are matched with at first."""
 MAX_KNOWN = 3
 """Largest number of earlier poses of a query that the fallback features judge, too."""
-MAX_IN_MEMORY = 1 << 30
-"""Largest size in bytes of global descriptors (float64) that an open map keeps in memory; larger ones stay on disk."""
+MAX_IN_MEMORY = 1 << 29
+"""Largest size in bytes of global descriptors (float32) that an open map keeps in memory; larger ones stay on disk."""
 Ranked = tuple[NDArray[np.int64], NDArray[np.float64]]
 """Rows (k,) of map images in their session, best first, and their scores (k,)."""
 
@@ -791,20 +791,10 @@ class ReferenceSearch:
 
     def _nearest(self, vector: NDArray[np.float32], k: int, allowed: NDArray[np.bool_] | None) -> Ranked:
         """Return the k map images that are most similar to a vector, with the scores and in the order of `search`."""
-        of_map, rows, dims = self._descriptors, self.rows, self._stored[0].dims
-        if self._index is not None or isinstance(of_map, Vectors):
-            found = search(vector[None], of_map, k, "torch", "cpu", index=self._index, allowed=allowed, dims=dims)
-            scores, nearest = (of_vector[0, found[1][0] >= 0] for of_vector in found)
-            return rows[nearest], scores.astype(np.float64)
-        ends = np.cumsum(dims)[:-1]
-        parts = zip(np.split(of_map, ends, axis=1), np.split(vector.astype(np.float64), ends), strict=True)
-        products = [np.einsum("nd,d->n", descriptors, described) for descriptors, described in parts]
-        scores = (products[0] if len(products) == 1 else fuse(products)).astype(np.float32)
-        if not np.isfinite(scores).all():
-            raise ValueError("The descriptors of the query or of the map have NaN or infinite values.")
-        candidates = np.arange(len(rows)) if allowed is None else np.flatnonzero(allowed)
-        nearest = candidates[np.argsort(-scores[candidates], kind="stable")[:k]]
-        return rows[nearest], scores[nearest].astype(np.float64)
+        dims = self._stored[0].dims
+        found = search(vector[None], self._descriptors, k, index=self._index, allowed=allowed, dims=dims)
+        scores, nearest = (of_vector[0, found[1][0] >= 0] for of_vector in found)
+        return self.rows[nearest], scores.astype(np.float64)
 
     def _rerank(self, ranked: Ranked, view: View) -> Ranked:
         """Return rows of map images and their numbers of verified matches, most first, as the rerank stage does."""
@@ -860,11 +850,11 @@ class ReferenceSearch:
         return vectors.choose(np.flatnonzero(posed)), rows[posed]
 
     @cached_property
-    def _descriptors(self) -> Floats | Vectors:
+    def _descriptors(self) -> NDArray[np.float32] | Vectors:
         """Those of `_stored`, in memory unless the map is large."""
         vectors = self._stored[0]
-        in_memory = np.dtype(np.float64).itemsize * vectors.shape[1] * len(vectors) < MAX_IN_MEMORY
-        return vectors[:].astype(np.float64) if in_memory else vectors
+        in_memory = np.dtype(np.float32).itemsize * vectors.shape[1] * len(vectors) < MAX_IN_MEMORY
+        return vectors[:] if in_memory else vectors
 
     @cached_property
     def _index(self) -> VectorIndex | None:
