@@ -38,7 +38,7 @@ MATCHER_WEIGHTS: dict[tuple[str, str], WeightsSource] = {
     ("lightglue", "aliked"): weights.ALIKED_LIGHTGLUE,
 }
 """Weights of the matchers that are networks, by matcher and kind of features."""
-StageSettings = TypeVar("StageSettings", LocalizeSettings, RerankSettings)
+StageSettings = TypeVar("StageSettings", bound=LocalizeSettings | RerankSettings)
 _BLOCK = 64  # number of rays that are compared with the same rays of the other image
 _BLOCKS_AT_ONCE = 8  # number of blocks that are processed at once
 _FAR_REACH = 0.1  # reach of a ray, radians, from which it is compared apart
@@ -106,7 +106,8 @@ def resolve_auto(settings: StageSettings) -> StageSettings:
     if settings.features.kinds != [AUTO]:
         return settings
     kinds = {"kinds": ["sift"]} if isinstance(settings, RerankSettings) else _auto_kinds(settings)
-    return settings.model_copy(update={"features": settings.features.model_copy(update=kinds)})
+    resolved: Any = settings.model_copy(update={"features": settings.features.model_copy(update=kinds)})
+    return resolved
 
 
 def _auto_kinds(settings: LocalizeSettings | RerankSettings) -> dict[str, list[str]]:

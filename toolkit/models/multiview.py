@@ -221,18 +221,11 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class Views:
-    """Images for the network, and how original pixels map to network pixels.
-
-    Image coordinates (x, y) are in pixels; the center of the top-left one is (0.5, 0.5).
-    """
+class Views(Layout):
+    """Images for the network, and how original pixels map to network pixels."""
 
     images: Tensor
     """(S, 3, H, W) float32, RGB in [0, 1]."""
-    scale: Floats
-    """(S, 2) for x and y. Point (x, y) of original image i is at scale[i] * (x, y) + offset[i] in images[i]."""
-    offset: Floats
-    """(S, 2), network pixels."""
     sizes: Ints
     """(S, 2): width and height of the original images."""
 
@@ -290,7 +283,7 @@ class Loader:
         images = torch.ones(len(shown), 3, height, width)
         for canvas, image in zip(images, shown, strict=True):
             canvas[:] = centered(torch.from_numpy(np.array(image)).permute(2, 0, 1).float() / 255, layout.size)
-        return Views(images, layout.scale, layout.offset, np.array(sizes, np.int64))
+        return Views(**vars(layout), images=images, sizes=np.array(sizes, np.int64))
 
 
 def centered(image: Tensor, size: Size) -> Tensor:
