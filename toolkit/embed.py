@@ -383,11 +383,9 @@ def _write_tables(folder: Path, capture: str, part: _Subsession, failed: dict[in
     if failed:
         log.warning("%s/%s: %d of %d images cannot be read, see %s",
                     session.id, part.name, len(failed), len(table), unreadable)  # fmt: skip
-        with write_atomic(unreadable) as temporary:
-            table[table["reason"] != ""].to_csv(temporary, index=False)
+        write_text(unreadable, table[table["reason"] != ""].to_csv(index=False))
     else:
         unreadable.unlink(missing_ok=True)
     embedded = table[table["reason"] == ""].drop(columns="reason").reset_index(drop=True)
-    with write_atomic(folder / "manifest.csv") as temporary:
-        embedded.to_csv(temporary, index_label="row_index")
+    write_text(folder / "manifest.csv", embedded.to_csv(index_label="row_index"))
     return [folder / "manifest.csv", *([unreadable] if failed else [])]

@@ -258,7 +258,10 @@ class DepthAnything3(MultiView):
     def _predictions(
         self, tokens: Tensor, heads: tuple[str, ...], size: tuple[int, int], reference: str = "saddle_balanced"
     ) -> dict[str, Any]:
-        cameras = self._camera_tokens(tokens, reference)
+        chosen = choose_reference(tokens[:, :, 0].float(), reference)
+        # The official code also moves the reference view to the front, which changes rounding only.
+        is_reference = torch.arange(tokens.shape[1], device=tokens.device) == chosen[:, None]
+        cameras = torch.where(is_reference[..., None], *self.trunk.camera_token[0])
         last = len(self.trunk.blocks) - 1
         read = {last, *(self.dense_layers if "depth" in heads else ())}
         rows, columns = size[0] // PATCH, size[1] // PATCH
@@ -271,15 +274,6 @@ class DepthAnything3(MultiView):
             values, confidence = dense_output(self.head, layers, self.dense_layers, size)
             output["depth"], output["depth_conf"] = values[..., 0].exp(), confidence
         return output
-
-    def _camera_tokens(self, tokens: Tensor, reference: str) -> Tensor:
-        """Return the learned camera tokens (B, S, C) for tokens from `encode`. The official code also moves the
-        reference view to the front, which changes rounding only.
-        """
-        chosen = choose_reference(tokens[:, :, 0].float(), reference)
-        is_reference = torch.arange(tokens.shape[1], device=tokens.device) == chosen[:, None]
-        reference_token, other_token = self.trunk.camera_token[0]
-        return torch.where(is_reference[..., None], reference_token, other_token)
 
 
 def _cameras(pose_enc: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
