@@ -384,7 +384,7 @@ def verified_matches(
 @fixed_sums
 def epipolar_matches(
     size_a: tuple[int, int], pixels_a: Floats, size_b: tuple[int, int], pixels_b: Floats,
-    scores: NDArray[np.floating], seed: int = 0, tests: int = 1,
+    scores: NDArray[np.floating], tests: int = 1,
 ) -> Ints:  # fmt: skip
     """Return the indices of matches that agree with one fundamental matrix, as `verified_matches` without intrinsics.
 
@@ -393,7 +393,6 @@ def epipolar_matches(
     Args:
         size_a, size_b: width and height of the images, pixels.
         pixels_a, pixels_b, scores, tests: see `verified_matches`.
-        seed: of the samples.
     """
     if len(scores) < 8:
         return np.zeros(0, np.int64)
@@ -403,7 +402,7 @@ def epipolar_matches(
     scale = max(size_a) / max(size_b)
     threshold_px = MAX_ERROR_SHARE * max(size_a)
     try:
-        _, mask = cv2.findFundamentalMat(pixels_a, scale * pixels_b, _prosac(threshold_px, seed))
+        _, mask = cv2.findFundamentalMat(pixels_a, scale * pixels_b, _prosac(threshold_px, 0))
     except cv2.error:  # OpenCV's assertion where all models are degenerate: few matches, most of them on a small strip
         mask = None
     agree = np.zeros(0, np.int64) if mask is None else np.flatnonzero(np.ravel(mask))

@@ -177,8 +177,8 @@ def dense_output(
     return result[..., :-1], 1 + result[..., -1].exp()
 
 
-def add_position(x: Tensor, aspect: float, factor: float = 0.1) -> Tensor:
-    """Add sines and cosines of each pixel's x (first C / 2 channels) and y (other channels) to maps (N, C, h, w).
+def add_position(x: Tensor, aspect: float) -> Tensor:
+    """Add 0.1 times sines and cosines of each pixel's x (first C / 2 channels) and y (others) to maps (N, C, h, w).
 
     Works in place. x and y are coordinates on an image plane with half diagonal 1 and width / height = `aspect`.
     """
@@ -192,7 +192,7 @@ def add_position(x: Tensor, aspect: float, factor: float = 0.1) -> Tensor:
     ):
         last = span * (count - 1) / count
         angles = frequencies[:, None] * torch.linspace(-last, last, count)
-        waves = (torch.cat([angles.sin(), angles.cos()]).float() * factor).to(x.device)
+        waves = (torch.cat([angles.sin(), angles.cos()]).float() * 0.1).to(x.device)
         x[:, channels].add_(waves.unsqueeze(axis))
     return x
 
