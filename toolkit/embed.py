@@ -141,7 +141,9 @@ class _Model:
         ids = [f"{key}_{split}" for key in self.devices for split in ("map", "query")]
         ids = [id_ for id_ in ids if id_ in capture]
         parts, unreadable = self._subsessions(ids, subsession)
-        embedder = self._open_embedder()
+        (model,) = settings.models
+        options = {"vocabulary": self._vocabulary()} if model == "vlad" else settings.of_network
+        embedder = create_embedder(model, **options)
         if shows_upright(embedder, settings.upright):
             turns = upright_turns(capture, settings.world_up)
             parts = [replace(part, turns=turns.of(part.session, part.rows)) for part in parts]
@@ -243,10 +245,6 @@ class _Model:
             known = ", ".join(part.name for part in parts)
             raise ManifestError(f"No images of subsession {subsession!r} in {', '.join(ids)}; known: {known}.")
         return selected, unreadable
-
-    def _open_embedder(self) -> Embedder:
-        (name,), settings = self.settings.models, self.settings
-        return create_embedder(name, **({"vocabulary": self._vocabulary()} if name == "vlad" else settings.of_network))
 
     def _vocabulary(self) -> Path:
         """Learn the VLAD vocabulary from the map images of all devices, unless the file is current."""

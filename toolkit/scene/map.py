@@ -410,7 +410,9 @@ class Map:
         result = replace(result, found_by="+".join([result.found_by, *(kind.name for kind in self.escalation)]))
         if first.status is Status.OK:
             result = self._with_rivals_of(first, result)
-        better = result.status.rank >= max(first.status.rank, 1) or self._finds_rival(result)
+        # Not `ok` beside its rivals, even if all else is certain: what was first may be one of them.
+        rivaled = self._beside(1.0, result.rivals) < self.settings.pnp.ok_probability
+        better = result.status.rank >= max(first.status.rank, 1) or (result.status is Status.LOW_CONFIDENCE and rivaled)
         earlier = first.first_seconds
         return replace(
             result if better else first,
@@ -418,11 +420,6 @@ class Map:
             first_seconds=round(first.seconds, 4) if earlier is None else earlier,
             context=first.context,  # it has all references
         )
-
-    def _finds_rival(self, result: QueryResult) -> bool:
-        """Tell whether a pose cannot be `ok` beside its rivals, even if all else is certain."""
-        beside = self._beside(1.0, result.rivals)
-        return result.status is Status.LOW_CONFIDENCE and beside < self.settings.pnp.ok_probability
 
     def _beside(self, probability: float, rivals: Sequence[Rival]) -> float:
         """Return the probability that a pose is correct, bounded by its rivals in this map."""
