@@ -177,25 +177,21 @@ class Map:
             pairs = [alone]
         localized = last_localized(files, pairs)
         reranked = Path(localized[1][RETRIEVAL]).name == files.reranked_dir.name
-        return replace(cls._stored_in(device, localized, files.features, files.maps), files=files, reranked=reranked)
+        return replace(cls.of_pair(localized, device, files.features, files.maps), files=files, reranked=reranked)
 
     @classmethod
-    def of_pair(cls, poses: str | Path, device: str, features_dir: str | Path, map_dir: str | Path) -> "Map":
+    def of_pair(cls, poses: Path | Localized, device: str, features_dir: Path, map_dir: Path) -> "Map":
         """Open the map of a finished pair, with the settings that the pair was localized with, from the given files.
 
         Args:
-            poses: `poses/<pair>.h5`.
+            poses: `poses/<pair>.h5`, or what `how_localized` returns for it.
             device: the map device.
             features_dir, map_dir: as given to `localize_pairs`.
 
         Raises:
             ArtifactError, WeightsError: as `open`.
         """
-        return cls._stored_in(device, how_localized(Path(poses)), Path(features_dir), Path(map_dir))
-
-    @classmethod
-    def _stored_in(cls, device: str, localized: Localized, features_dir: Path, map_dir: Path) -> "Map":
-        settings, h5_attributes, names = localized
+        settings, h5_attributes, names = how_localized(poses) if isinstance(poses, Path) else poses
         (kinds, escalation), mapped = create_methods(settings), list[MappedFeatures]()
         root = Path(h5_attributes[SESSIONS_ROOT])
         for name, kind in zip(names, kinds if settings.map is not None else (), strict=True):
