@@ -143,7 +143,9 @@ class _Model:
         ids = [f"{key}_{split}" for key in self.devices for split in ("map", "query")]
         ids = [id_ for id_ in ids if id_ in capture]
         parts, unreadable = self._subsessions(ids, subsession)
-        embedder = self._open_embedder()
+        (model,) = settings.models
+        options = {"vocabulary": self._vocabulary()} if model == "vlad" else settings.of_network
+        embedder = create_embedder(model, **options)
         if shows_upright(embedder, settings.upright):
             turns = upright_turns(capture, settings.world_up)
             parts = [replace(part, turns=turns.of(part.session, part.rows)) for part in parts]
@@ -260,18 +262,6 @@ class _Model:
             known = ", ".join(part.name for part in parts)
             raise ManifestError(f"No images of subsession {subsession!r} in {', '.join(ids)}; known: {known}.")
         return selected, unreadable
-
-    def _open_embedder(self) -> Embedder:
-        (name,), settings = self.settings.models, self.settings
-        if name == "vlad":
-            return create_embedder(name, vocabulary=self._vocabulary())
-        return create_embedder(
-            name,
-            checkpoint=settings.checkpoint,
-            device=settings.compute_device,
-            dtype_compute=settings.dtype_compute,
-            image_size=settings.image_size,
-        )
 
     def _vocabulary(self) -> Path:
         """Learn the VLAD vocabulary from the map images of all devices, unless the file is current.
@@ -427,11 +417,9 @@ def _write_tables(folder: Path, capture: str, part: _Subsession, failed: dict[in
     if failed:
         log.warning("%s/%s: %d of %d images cannot be read, see %s",
                     session.id, part.name, len(failed), len(table), unreadable)  # fmt: skip
-        with write_atomic(unreadable) as temporary:
-            table[table["reason"] != ""].to_csv(temporary, index=False)
+        write_text(unreadable, table[table["reason"] != ""].to_csv(index=False))
     else:
         unreadable.unlink(missing_ok=True)
     embedded = table[table["reason"] == ""].drop(columns="reason").reset_index(drop=True)
-    with write_atomic(folder / "manifest.csv") as temporary:
-        embedded.to_csv(temporary, index_label="row_index")
+    write_text(folder / "manifest.csv", embedded.to_csv(index_label="row_index"))
     return [folder / "manifest.csv", *([unreadable] if failed else [])]

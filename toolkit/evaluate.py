@@ -25,8 +25,8 @@ from toolkit.files import (
     read_references,
     require_whole,
     why_older,
-    write_atomic,
     write_sidecar,
+    write_text,
 )
 from toolkit.geometry import Floats
 from toolkit.manifest import EvaluateSettings
@@ -117,8 +117,11 @@ def evaluate_scene(
             session = capture[f"{query}_query"]
             truths += filter(Path.is_file, [session.path / ALIGNED])
             keys, truth = _queries_with_truth(session, queries, messages)
-            tables = (_table_of(poses_dir, capture.name, mapped, query) for mapped in maps)
-            messages += metrics.camera_messages(session, [table for table in tables if table is not None])
+            tables = list[pd.DataFrame]()
+            for mapped in maps:
+                with suppress(ArtifactError):  # `_read_results` reports it
+                    tables.append(PairResults.of(poses_dir, capture.name, mapped, query).table)
+            messages += metrics.camera_messages(session, tables)
         except CaptureError as error:
             reason = str(error)
         for mapped in maps:
@@ -231,8 +234,8 @@ def evaluate_sequences(
             changed = metrics.named_by_unit(sequence.changes(keys, truth, limits[-1], length).assign(**pair), unit)
             single = PairResults.of(poses_dir, capture.name, mapped, query).table
             # Results of earlier versions have no names of images.
-            images = single.reindex(columns=[*(key := ["timestamp", "device_id"]), "image"], fill_value="")
-            changes.append(changed.merge(images, "left", on=key))
+            images = single.reindex(columns=[*_KEY, "image"], fill_value="")
+            changes.append(changed.merge(images, "left", on=_KEY))
         except (CaptureError, ArtifactError) as error:
             logger.warning("%s: its sequences are not evaluated. %s", sequence.stem.name, error)
     tables = (pd.concat(parts, ignore_index=True) for parts in (steps, changes))
@@ -268,8 +271,7 @@ def write_evaluation(
             continue
         written.append(path)
         if isinstance(content, pd.DataFrame):
-            with write_atomic(path) as temporary:
-                content.to_csv(temporary, index=False)
+            write_text(path, content.to_csv(index=False))
         else:
             save_figure(content, path)
     write_sidecar(out / "recall.csv", settings, written[1:], made_from=sources, captured=truths)
@@ -288,13 +290,6 @@ def _queries_with_truth(session: Session, queries: str, messages: list[str]) -> 
         missing = np.sum(~has_truth)
         messages.append(f"{session.id}: {missing} of {len(keys)} queries have no ground truth and are left out.")
     return keys[has_truth].reset_index(drop=True), truth
-
-
-def _table_of(poses_dir: str | Path, scene: str, map_device: str, query_device: str) -> pd.DataFrame | None:
-    """Return the table of a pair; None if it cannot be read, which `_read_results` reports."""
-    with suppress(ArtifactError):
-        return PairResults.of(poses_dir, scene, map_device, query_device).table
-    return None
 
 
 def _read_results(path: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, str]:

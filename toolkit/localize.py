@@ -33,7 +33,6 @@ from toolkit.files import (
     read_sidecar,
     require_same,
     sidecar_path,
-    write_atomic,
     write_sidecar,
     write_text,
 )
@@ -408,8 +407,7 @@ class _Pair:
                         self.add_fallback(items, todo)
                         faulty |= self._distribute(items, todo, (time.perf_counter() - started) / len(todo))
         # If the run is killed before it writes the new poses, no poses of an earlier run may lie beside this file.
-        for poses in (self.file("txt"), sidecar_path(self.file("txt"))):
-            poses.unlink(missing_ok=True)
+        self.remove_poses()
         rows = dict[str, dict[str, Any]]()
 
         def groups() -> Iterator[tuple[str, dict[str, Any]]]:
@@ -541,9 +539,8 @@ def _write_poses(path: Path, rows: Sequence[dict[str, Any]], settings: LocalizeS
     """Write the table and the poses of a pair; the poses last, because their file marks the pair as finished."""
     columns = [*COLUMNS, *(PREDICTION_COLUMNS if settings.predicts else [])]
     columns += FALLBACK_COLUMNS if settings.features.escalation else []
-    with write_atomic(path.with_suffix(".csv")) as temporary:
-        table = pd.DataFrame(rows).rename(columns=POSES_UNIT).reindex(columns=columns)
-        in_unit_of_poses(table, settings.unit).to_csv(temporary, index=False)
+    table = pd.DataFrame(rows).rename(columns=POSES_UNIT).reindex(columns=columns)
+    write_text(path.with_suffix(".csv"), in_unit_of_poses(table, settings.unit).to_csv(index=False))
     posed = [row for row in rows if np.isfinite(row["world_from_rig"]).all()]
     covariances = np.array([row["covariance"] for row in posed]).reshape(-1, 6, 6)
     Trajectory.from_poses(

@@ -5,6 +5,7 @@ to the pipeline.
 """
 
 import ast
+import inspect
 import json
 import logging
 import os
@@ -564,16 +565,11 @@ def _manifest_of(run: Path | None, sessions: Path) -> Manifest:
 
 def _run_stage(stage: str, sessions: Path, files: SceneFiles, run: Path | None) -> None:
     """Run `embed`, `retrieve` or `localize` with the settings of the run that results are taken from, or defaults."""
-    manifest = _manifest_of(run, sessions)
-    folders = {
-        "embed": [files.embeddings],
-        "retrieve": [files.embeddings, files.retrieval_dir],
-        "localize": [files.retrieval_dir, files.poses_dir, files.features, files.maps],
-    }
-    name, known = ("embed_sessions", {"device"}) if stage == "embed" else (f"{stage}_pairs", {"queries", "pairs"})
-    values = {"queries": manifest.queries, **selection(manifest, sessions.parent)}
+    manifest, name = _manifest_of(run, sessions), "embed_sessions" if stage == "embed" else f"{stage}_pairs"
+    values = {"queries": manifest.queries, **selection(manifest, sessions.parent), **files.folders(stage)}
     run_stage = getattr(import_module(f"toolkit.{stage}"), name)
-    run_stage(sessions, *folders[stage], manifest.stage(stage), **{key: values[key] for key in known & values.keys()})
+    known = values.keys() & inspect.signature(run_stage).parameters.keys()
+    run_stage(sessions, settings=manifest.stage(stage), **{key: values[key] for key in known})
 
 
 def _user_names() -> dict[str, Any]:

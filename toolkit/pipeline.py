@@ -517,18 +517,13 @@ def _weights_needed(stage: str, settings: Settings) -> list[tuple[WeightsSource,
     """Return (weights, checkpoint from the settings) of each network that a stage runs with these settings."""
     if isinstance(settings, EmbedSettings):
         return [(EMBEDDER_WEIGHTS[name], settings.checkpoint) for name in settings.models if name in EMBEDDER_WEIGHTS]
+    if not isinstance(settings, LocalizeSettings | RerankSettings) or getattr(settings, "method", "") == "nearest":
+        return []
     needed: list[tuple[WeightsSource, str | None]] = []
-    if isinstance(settings, LocalizeSettings):
-        if settings.method == "nearest":
-            return needed
-        if settings.predicts and (network := ARCHITECTURES.get(settings.predictor.name)):
-            needed.append((network.weights, settings.predictor.checkpoint))
-        local = local_weights(resolve_auto(settings))
-    elif isinstance(settings, RerankSettings):
-        local = local_weights(resolve_auto(settings))
-    else:
-        return needed
-    for source, checkpoint in local:
+    predictor = settings.predictor if isinstance(settings, LocalizeSettings) and settings.predicts else None
+    if predictor and (network := ARCHITECTURES.get(predictor.name)):
+        needed.append((network.weights, predictor.checkpoint))
+    for source, checkpoint in local_weights(resolve_auto(settings)):
         section = source.setting.removeprefix("localize.")
         needed.append((replace(source, setting=f"{stage}.{section}"), checkpoint))
     return needed

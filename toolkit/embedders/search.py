@@ -201,10 +201,9 @@ def open_embeddings(folder: str | Path) -> tuple[Vectors, pd.DataFrame]:
         except (OSError, ValueError) as error:
             raise ArtifactError(f"Embeddings {path} cannot be read ({error}); embed again.") from error
         if list(table.columns) != MANIFEST_COLUMNS or matrix.ndim != 2 or len(matrix) != len(table):
-            found = (
-                f"{manifest} ({len(table)} rows, {', '.join(table.columns)}) does not fit {path.name} {matrix.shape}"
-            )
-            raise ArtifactError(f"{found}; expected {', '.join(MANIFEST_COLUMNS)}, one row per vector. Embed again.")
+            found = f"{manifest} ({len(table)} rows, {', '.join(table.columns)})"
+            fault = f"{found} does not fit {path.name} {matrix.shape}"
+            raise ArtifactError(f"{fault}; expected {', '.join(MANIFEST_COLUMNS)}, one row per vector. Embed again.")
         count, dim = matrix.shape
         if parts and (dim,) != parts[0].dims:
             raise ArtifactError(f"{path} has {dim} dimensions, {manifests[0].parent} {parts[0].dims[0]}; embed again.")
@@ -328,9 +327,8 @@ def load_index(embeddings: Path, map_id: str, vectors: Vectors, settings: Retrie
     file is missing or damaged, or was made from other vectors.
     """
     indexes = [_open(*file, settings) for file in _files(embeddings, map_id, vectors, settings)]
-    return (
-        VectorIndex(tuple(indexes), max(settings.index_candidates, settings.topk), settings.nprobe) if indexes else None
-    )
+    count = max(settings.index_candidates, settings.topk)
+    return VectorIndex(tuple(indexes), count, settings.nprobe) if indexes else None
 
 
 def _files(
@@ -661,8 +659,6 @@ def _backend(
         raise ValueError(f"Unknown backend {backend!r}; expected faiss or torch.")
     if backend == "torch" or len(dims) > 1 or masks is not None:
         return _torch_backend(query, masks, compute_device, dims)
-    import faiss
-
     if not faiss_gpu:
         return lambda block, _, number: faiss.knn(query, block, number, metric=faiss.METRIC_INNER_PRODUCT)
     if not hasattr(faiss, "StandardGpuResources"):

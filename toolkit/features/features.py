@@ -141,10 +141,10 @@ class LocalFeatures:
         return len(self.keypoints)
 
     @classmethod
-    def none(cls, image_size: tuple[int, int], length: int = 128) -> "LocalFeatures":
-        """Return an empty set of features; `length` is that of the descriptors."""
+    def none(cls, image_size: tuple[int, int]) -> "LocalFeatures":
+        """Return an empty set of features."""
         zeros = np.zeros(0, np.float32)
-        return cls(zeros.reshape(0, 2), zeros, zeros, np.zeros((0, length), np.uint8), image_size)
+        return cls(zeros.reshape(0, 2), zeros, zeros, np.zeros((0, 128), np.uint8), image_size)
 
     def take(self, part: slice | Ints) -> "LocalFeatures":
         """Return some of the features, by index."""
@@ -267,13 +267,13 @@ def usable(features: LocalFeatures, mask: Path | None, camera: pycolmap.Camera) 
 # SIFT
 
 
-def stretch_contrast(gray: NDArray[np.uint8], max_gain: float = 8.0) -> NDArray[np.uint8]:
-    """Stretch the 1st to 99th percentile of an image to the full range, with a gain of at most `max_gain`.
+def stretch_contrast(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Stretch the 1st to 99th percentile of an image to the full range, with a gain of at most 8.
 
     A gain does not change SIFT descriptors, but a dark image has no keypoints above a fixed contrast threshold.
     """
     low, high = np.percentile(gray[::4, ::4], (1.0, 99.0))
-    gain = min(255.0 / max(high - low, 1.0), max_gain)
+    gain = min(255.0 / max(high - low, 1.0), 8.0)
     table = np.clip((np.arange(256) - low) * gain, 0, 255).astype(np.uint8)
     return np.asarray(cv2.LUT(gray, table), np.uint8)
 

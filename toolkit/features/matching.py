@@ -38,7 +38,7 @@ MATCHER_WEIGHTS: dict[tuple[str, str], WeightsSource] = {
     ("lightglue", "aliked"): weights.ALIKED_LIGHTGLUE,
 }
 """Weights of the matchers that are networks, by matcher and kind of features."""
-StageSettings = TypeVar("StageSettings", LocalizeSettings, RerankSettings)
+StageSettings = TypeVar("StageSettings", bound=LocalizeSettings | RerankSettings)
 _BLOCK = 64  # number of rays that are compared with the same rays of the other image
 _BLOCKS_AT_ONCE = 8  # number of blocks that are processed at once
 _FAR_REACH = 0.1  # reach of a ray, radians, from which it is compared apart
@@ -106,7 +106,8 @@ def resolve_auto(settings: StageSettings) -> StageSettings:
     if settings.features.kinds != [AUTO]:
         return settings
     kinds = {"kinds": ["sift"]} if isinstance(settings, RerankSettings) else _auto_kinds(settings)
-    return settings.model_copy(update={"features": settings.features.model_copy(update=kinds)})
+    resolved: Any = settings.model_copy(update={"features": settings.features.model_copy(update=kinds)})
+    return resolved
 
 
 def _auto_kinds(settings: LocalizeSettings | RerankSettings) -> dict[str, list[str]]:
@@ -383,7 +384,7 @@ def verified_matches(
 @fixed_sums
 def epipolar_matches(
     size_a: tuple[int, int], pixels_a: Floats, size_b: tuple[int, int], pixels_b: Floats,
-    scores: NDArray[np.floating], seed: int = 0, tests: int = 1,
+    scores: NDArray[np.floating], tests: int = 1,
 ) -> Ints:  # fmt: skip
     """Return the indices of matches that agree with one fundamental matrix, as `verified_matches` without intrinsics.
 
@@ -392,7 +393,6 @@ def epipolar_matches(
     Args:
         size_a, size_b: width and height of the images, pixels.
         pixels_a, pixels_b, scores, tests: see `verified_matches`.
-        seed: of the samples.
     """
     if len(scores) < 8:
         return np.zeros(0, np.int64)
@@ -402,7 +402,7 @@ def epipolar_matches(
     scale = max(size_a) / max(size_b)
     threshold_px = MAX_ERROR_SHARE * max(size_a)
     try:
-        _, mask = cv2.findFundamentalMat(pixels_a, scale * pixels_b, _prosac(threshold_px, seed))
+        _, mask = cv2.findFundamentalMat(pixels_a, scale * pixels_b, _prosac(threshold_px, 0))
     except cv2.error:  # OpenCV's assertion where all models are degenerate: few matches, most of them on a small strip
         mask = None
     agree = np.zeros(0, np.int64) if mask is None else np.flatnonzero(np.ravel(mask))

@@ -40,6 +40,7 @@ class NetworkExtractor(Remade):
     threaded = False
     name: ClassVar[str]  # key of the features in `KINDS`
     title: ClassVar[str]  # name of the network in messages
+    cpu_batch = 2  # images per batch on a CPU: more take more memory and are not faster; 0: one per thread of torch
     min_long_side = 0  # smaller images are enlarged to this length of the longer side, pixels
     defaults: ClassVar[AlikedSettings | SuperPointSettings]
 
@@ -68,7 +69,8 @@ class NetworkExtractor(Remade):
         # All CPUs extract the same features.
         dtype = "float32" if dtype == "auto" and self._device.type == "cpu" else dtype
         self._dtype = resolve_precision(dtype, self._device)
-        self.batch_size = batch_size or (self._batch_on_cpu() if self._device.type == "cpu" else 16)
+        on_cpu = self.cpu_batch or torch.get_num_threads()
+        self.batch_size = batch_size or (on_cpu if self._device.type == "cpu" else 16)
         model = self._load(checkpoint)
         self._weights = weights_digest(model)
         self._model: Any = on_device(model, self._device, self.title)
@@ -78,9 +80,6 @@ class NetworkExtractor(Remade):
     def settings(self) -> dict[str, Any]:
         precision = str(self._dtype).removeprefix("torch.")
         return {"name": self.name, "weights": self._weights, "dtype_compute": precision, **self._values.model_dump()}
-
-    def _batch_on_cpu(self) -> int:
-        return 2  # larger batches take more memory and are not faster
 
     def _load(self, checkpoint: str | Path | Mapping[str, Tensor] | None) -> nn.Module:
         """Return the network with its weights, on the CPU."""
@@ -158,10 +157,8 @@ class AlikedExtractor(NetworkExtractor):
     name = "aliked"
     title = "ALIKED"
     min_long_side = 640
+    cpu_batch = 0
     defaults = AlikedSettings()
-
-    def _batch_on_cpu(self) -> int:
-        return torch.get_num_threads()
 
     def _load(self, checkpoint: str | Path | Mapping[str, Tensor] | None) -> Aliked:
         model = self._values.model
@@ -290,7 +287,7 @@ class LightGlueMatcher(Remade):
         model.fold_(self._dtype)
         self._model: Any = on_device(model, self._device, "LightGlue")
         self._fitting_images = Fitting(self._encode, "images", self._device)
-        self._fitting_pairs = Fitting(self._forward, "pairs of images", self._device)
+        self._fitting_pairs = Fitting(lambda pairs: self._forward(*pairs.unbind(1)), "pairs of images", self._device)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -331,7 +328,7 @@ class LightGlueMatcher(Remade):
             return self._fitting_pairs(pad_sequence(list(states), batch_first=True).unflatten(0, (-1, 2)))
 
         def match_one(pair: tuple[Tensor, Tensor]) -> Tensor:
-            matches = self._forward_pairs(pair[0][None], pair[1][None])[0]
+            matches = self._forward(pair[0][None], pair[1][None])[0]
             release_memory()  # hundreds of megabytes, as the numbers of features differ after each layer
             return matches
 
@@ -363,15 +360,11 @@ class LightGlueMatcher(Remade):
         states = self._model.encode(xy, batch[..., 2:-1], mask)
         return torch.cat([xy, states, batch[..., -1:]], dim=-1)
 
-    def _forward(self, batch: Tensor) -> Tensor:
-        """Return for each feature of the first image its partner (-1: none) and the confidence, (B, N, 2).
+    def _forward(self, a: Tensor, b: Tensor) -> Tensor:
+        """Return for each feature of the first images its partner (-1: none) and the confidence, (B, N, 2).
 
-        The batch (B, 2, N, 2 + DIM + 1) has, for each image of a pair, the normalized x y, the state of the network,
-        and 1; padded with rows of zeros.
+        Both images (B, N, 2 + DIM + 1) have the normalized x y, the state of the network, and 1; padded with zeros.
         """
-        return self._forward_pairs(*batch.unbind(1))
-
-    def _forward_pairs(self, a: Tensor, b: Tensor) -> Tensor:
         masks = _mask(a), _mask(b)
         partners, scores = self._model((a[..., :2], b[..., :2]), (a[..., 2:-1], b[..., 2:-1]), masks, self._one_by_one)
         partners = partners.where(scores > self._min_score, -1)

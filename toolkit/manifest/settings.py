@@ -283,6 +283,12 @@ class EmbedSettings(Settings):
     def models(self) -> list[str]:
         return [self.model] if isinstance(self.model, str) else self.model
 
+    @property
+    def of_network(self) -> dict[str, Any]:
+        """Arguments of `create_embedder` for a learned model."""
+        of_all = {"checkpoint": self.checkpoint, "image_size": self.image_size, "dtype_compute": self.dtype_compute}
+        return of_all | {"device": self.compute_device}
+
 
 class MaskSettings(Settings):
     """Priors on the query's location that restrict the search to a part of the map: rough poses, GPS, radio signals.

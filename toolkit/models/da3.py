@@ -16,25 +16,14 @@ from torch import Tensor, nn
 
 from toolkit.geometry import Floats, invert, make_pose
 from toolkit.models import multiview
-from toolkit.models.multiview import (
-    ConvolutionalHead,
-    Fit,
-    LayerTokens,
-    Loader,
-    MultiView,
-    Size,
-    Source,
-    Views,
-    dense_output,
-)
+from toolkit.models.multiview import ConvolutionalHead, Fit, LayerTokens, Loader, MultiView, Size, dense_output
 from toolkit.models.vit import PATCH, Dinov2, normalized, places_of_view, rope_of_places, set_matrix_type
 from toolkit.models.weights import read_state_dict
 
-__all__ = ["HEADS", "MODES", "DepthAnything3", "Views", "cameras_from_pose_encoding", "load_images"]
+__all__ = ["HEADS", "DepthAnything3", "cameras_from_pose_encoding", "load_images"]
 
 HEADS = ("camera", "depth")
 SIDE = 504
-MODES = ("upper_bound_resize",)
 REFERENCES = ("saddle_balanced", "first")
 """Ways to choose the reference view, whose frame is the world."""
 _MIN_CHOICE = 3  # with fewer views, the first is the reference
@@ -70,17 +59,13 @@ def _fit(size: Size, mode: str) -> Fit:
     return resized, np.divide(resized, size), (0.0, 0.0)
 
 
-LOADER = Loader(MODES, _fit, _show, crops=True)
+LOADER = Loader(("upper_bound_resize",), _fit, _show, crops=True)
+load_images = LOADER.load
+"""Loads images as the official loader does; see `multiview.Loader.load`.
 
-
-def load_images(sources: Sequence[Source], mode: str = "upper_bound_resize") -> Views:
-    """Load images as the official loader does; see `multiview.Loader.load`.
-
-    Resizes the longer side to 504 pixels, then both sides to the nearest multiples of 14 (by OpenCV, with area
-    interpolation if the image shrinks, else bicubic). Crops images of different sizes at their center to the smallest
-    width and height among them. Transparent pixels become white; the official loader keeps their hidden color.
-    """
-    return LOADER.load(sources, mode)
+Resizes the longer side to 504 pixels, then both sides to the nearest multiples of 14 (by OpenCV, with area
+interpolation if the image shrinks, else bicubic). Crops images of different sizes at their center to the smallest
+width and height among them. Transparent pixels become white; the official loader keeps their hidden color."""
 
 
 def cameras_from_pose_encoding(pose_enc: ArrayLike, size: tuple[int, int]) -> tuple[Floats, Floats]:
@@ -241,13 +226,12 @@ class DepthAnything3(MultiView):
     ) -> None:
         """
         Args:
-            heads, compute_dtype: see `MultiView`.
+            heads, compute_dtype: see `MultiView.from_checkpoint`.
             dim, depth, num_heads, grid, alternate_from: sizes of the trunk, see `Backbone`.
             dense_layers: the four blocks that the depth head reads.
             dense_channels, dense_features: channels of the depth head.
         """
-        super().__init__(heads, compute_dtype)
-        self.dense_layers = tuple(dense_layers)
+        super().__init__(heads, dim, dense_layers)
         self.backbone = nn.ModuleDict({"pretrained": Backbone(dim, depth, num_heads, grid, alternate_from)})
         set_matrix_type(self.backbone, compute_dtype)
         if "camera" in self.heads:
@@ -268,17 +252,16 @@ class DepthAnything3(MultiView):
     def trunk(self) -> Backbone:
         return cast(Backbone, self.backbone["pretrained"])
 
-    @property
-    def channels(self) -> int:
-        return self.trunk.camera_token.shape[-1]
-
     def _encoded(self, images: Tensor) -> Tensor:
         return self.trunk.encode(images)
 
     def _predictions(
         self, tokens: Tensor, heads: tuple[str, ...], size: tuple[int, int], reference: str = "saddle_balanced"
     ) -> dict[str, Any]:
-        cameras = self._camera_tokens(tokens, reference)
+        chosen = choose_reference(tokens[:, :, 0].float(), reference)
+        # The official code also moves the reference view to the front, which changes rounding only.
+        is_reference = torch.arange(tokens.shape[1], device=tokens.device) == chosen[:, None]
+        cameras = torch.where(is_reference[..., None], *self.trunk.camera_token[0])
         last = len(self.trunk.blocks) - 1
         read = {last, *(self.dense_layers if "depth" in heads else ())}
         rows, columns = size[0] // PATCH, size[1] // PATCH
@@ -291,15 +274,6 @@ class DepthAnything3(MultiView):
             values, confidence = dense_output(self.head, layers, self.dense_layers, size)
             output["depth"], output["depth_conf"] = values[..., 0].exp(), confidence
         return output
-
-    def _camera_tokens(self, tokens: Tensor, reference: str) -> Tensor:
-        """Return the learned camera tokens (B, S, C) for tokens from `encode`. The official code also moves the
-        reference view to the front, which changes rounding only.
-        """
-        chosen = choose_reference(tokens[:, :, 0].float(), reference)
-        is_reference = torch.arange(tokens.shape[1], device=tokens.device) == chosen[:, None]
-        reference_token, other_token = self.trunk.camera_token[0]
-        return torch.where(is_reference[..., None], reference_token, other_token)
 
 
 def _cameras(pose_enc: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:

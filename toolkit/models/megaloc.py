@@ -114,13 +114,10 @@ class MegaLoc(nn.Module):
         """
         super().__init__()
         self.clusters = clusters
+        self.dim = out
+        """Length of the descriptor."""
         self.backbone = Backbone(dim, depth, num_heads, grid)
         self.aggregator = Aggregator(dim, clusters, cluster_dim, token_dim, hidden, out)
-
-    @property
-    def dim(self) -> int:
-        """Length of the descriptor."""
-        return self.aggregator.linear.out_features
 
     @classmethod
     def from_checkpoint(cls, checkpoint: str | Path | Mapping[str, Tensor]) -> "MegaLoc":

@@ -177,8 +177,8 @@ def dense_output(
     return result[..., :-1], 1 + result[..., -1].exp()
 
 
-def add_position(x: Tensor, aspect: float, factor: float = 0.1) -> Tensor:
-    """Add sines and cosines of each pixel's x (first C / 2 channels) and y (other channels) to maps (N, C, h, w).
+def add_position(x: Tensor, aspect: float) -> Tensor:
+    """Add 0.1 times sines and cosines of each pixel's x (first C / 2 channels) and y (others) to maps (N, C, h, w).
 
     Works in place. x and y are coordinates on an image plane with half diagonal 1 and width / height = `aspect`.
     """
@@ -192,7 +192,7 @@ def add_position(x: Tensor, aspect: float, factor: float = 0.1) -> Tensor:
     ):
         last = span * (count - 1) / count
         angles = frequencies[:, None] * torch.linspace(-last, last, count)
-        waves = (torch.cat([angles.sin(), angles.cos()]).float() * factor).to(x.device)
+        waves = (torch.cat([angles.sin(), angles.cos()]).float() * 0.1).to(x.device)
         x[:, channels].add_(waves.unsqueeze(axis))
     return x
 
@@ -221,18 +221,11 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class Views:
-    """Images for the network, and how original pixels map to network pixels.
-
-    Image coordinates (x, y) are in pixels; the center of the top-left one is (0.5, 0.5).
-    """
+class Views(Layout):
+    """Images for the network, and how original pixels map to network pixels."""
 
     images: Tensor
     """(S, 3, H, W) float32, RGB in [0, 1]."""
-    scale: Floats
-    """(S, 2) for x and y. Point (x, y) of original image i is at scale[i] * (x, y) + offset[i] in images[i]."""
-    offset: Floats
-    """(S, 2), network pixels."""
     sizes: Ints
     """(S, 2): width and height of the original images."""
 
@@ -265,12 +258,13 @@ class Loader:
             borders = ([width, height] - fitted) // 2
         return Layout(mode, (height, width), scales, offsets + borders)
 
-    def load(self, sources: Sequence[Source], mode: str) -> Views:
-        """Load images. Blends RGBA with white. Does not apply the EXIF orientation.
+    def load(self, sources: Sequence[Source], mode: str | None = None) -> Views:
+        """Load images; None: in the first mode. Blends RGBA with white. Does not apply the EXIF orientation.
 
         Raise ImageError for a file that cannot be decoded or an elongated image; ValueError for no images or another
         mode.
         """
+        mode = self.modes[0] if mode is None else mode
         if mode not in self.modes:
             raise ValueError(f"mode is {mode!r}; expected one of {list(self.modes)}.")
         if not len(sources):
@@ -289,7 +283,7 @@ class Loader:
         images = torch.ones(len(shown), 3, height, width)
         for canvas, image in zip(images, shown, strict=True):
             canvas[:] = centered(torch.from_numpy(np.array(image)).permute(2, 0, 1).float() / 255, layout.size)
-        return Views(images, layout.scale, layout.offset, np.array(sizes, np.int64))
+        return Views(**vars(layout), images=images, sizes=np.array(sizes, np.int64))
 
 
 def centered(image: Tensor, size: Size) -> Tensor:
@@ -356,15 +350,14 @@ class MultiView(nn.Module):
     class_tokens: ClassVar[int] = 0
     """Number of tokens that `encode` returns before the patches of an image."""
     aggregator: Any
-    """The trunk: `patch_embed` encodes patches, `camera_token` is a parameter (..., C)."""
+    """The trunk: `patch_embed` encodes patches."""
 
-    def __init__(self, heads: Sequence[str], compute_dtype: torch.dtype) -> None:
-        """The heads are those to create, of `known_heads`, else raise ValueError; `compute_dtype`, float32 or bfloat16,
-        is for the trunk's matrix products and attention. Sums, norms and heads are float32.
+    def __init__(self, heads: Sequence[str], channels: int, dense_layers: Sequence[int]) -> None:
+        """The heads are those to create, of `known_heads`, else raise ValueError; `channels` are those of a token,
+        `dense_layers` the four layers that dense heads read.
         """
         super().__init__()
-        self.heads = _ordered_heads(heads, self.known_heads)
-        self.compute_dtype = compute_dtype
+        self.heads, self.channels, self.dense_layers = _ordered_heads(heads, self.known_heads), channels, dense_layers
 
     @classmethod
     def from_checkpoint(
@@ -379,14 +372,16 @@ class MultiView(nn.Module):
             checkpoint: the official file, `.pt` or `.safetensors`, or its tensors by name (shared, not copied, if
                 their data type stays).
             heads: the heads to create; None: all.
-            compute_dtype: as for the constructor. bfloat16 halves the memory of the weights.
+            compute_dtype: of the trunk's matrix products and attention, float32 or bfloat16, which halves the memory of
+                the weights. Sums, norms and heads are float32.
 
         Raises:
             WeightsError: no checkpoint, or one of another model; names missing, unexpected, mis-shaped keys.
             ValueError: unknown head.
         """
+        network: Any = cls  # takes other arguments than this base
         with torch.device("meta"):
-            model = cls(cls.known_heads if heads is None else heads, compute_dtype, **cls._sizes(checkpoint))
+            model: Self = network(cls.known_heads if heads is None else heads, compute_dtype, **cls._sizes(checkpoint))
         other_heads = (prefix for head, prefix in cls.prefixes.items() if head not in model.heads)
         load_checkpoint(model, checkpoint, cls.title, ignore=(*cls.unused, *other_heads))
         return model
@@ -395,11 +390,6 @@ class MultiView(nn.Module):
     def _sizes(cls, checkpoint: str | Path | Mapping[str, Tensor]) -> dict[str, Any]:
         """Return the constructor arguments in which the official checkpoints differ."""
         return {}
-
-    @property
-    def channels(self) -> int:
-        """Channels of a token."""
-        return int(self.aggregator.camera_token.shape[-1])
 
     @torch.no_grad()
     def encode(self, images: Tensor) -> Tensor:

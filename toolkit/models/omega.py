@@ -20,8 +20,6 @@ from toolkit.models.multiview import (
     Loader,
     MultiView,
     Size,
-    Source,
-    Views,
     add_position,
     cameras_from_pose_encoding,
     dense_output,
@@ -29,11 +27,10 @@ from toolkit.models.multiview import (
 )
 from toolkit.models.vit import Block, PatchEmbed, Rope, normalized, set_matrix_type
 
-__all__ = ["HEADS", "MODES", "VGGTOmega", "Views", "cameras_from_pose_encoding", "load_images"]
+__all__ = ["HEADS", "VGGTOmega", "cameras_from_pose_encoding", "load_images"]
 
 HEADS = ("camera", "depth")
 SIDE = 512
-MODES = ("balanced", "max_size")
 PATCH = 16
 """Side of a patch, pixels."""
 SPECIAL = 17
@@ -76,16 +73,12 @@ def _show(image: Image.Image, mode: str) -> Image.Image:
     return cropped.resize(resized_size(width, height, mode), Image.Resampling.BICUBIC)
 
 
-LOADER = Loader(MODES, _fit, _show)
+LOADER = Loader(("balanced", "max_size"), _fit, _show)
+load_images = LOADER.load
+"""Loads images as the official loader does; see `multiview.Loader.load`.
 
-
-def load_images(sources: Sequence[Source], mode: str = "balanced") -> Views:
-    """Load images as the official loader does; see `multiview.Loader.load`.
-
-    Crops images of more than 2 to 1 at their center. Resizes images (bicubic, by Pillow) in proportion, rounded to
-    multiples of 16: "balanced" to about the area of 512 x 512 pixels; "max_size" to a longer side of 512 pixels.
-    """
-    return LOADER.load(sources, mode)
+Crops images of more than 2 to 1 at their center. Resizes images (bicubic, by Pillow) in proportion, rounded to
+multiples of 16: "balanced", the default, to about the area of 512 x 512 pixels; "max_size" to a longer side of 512."""
 
 
 class PlaceRope(nn.Module):
@@ -251,8 +244,7 @@ class VGGTOmega(MultiView):
         """`register_layers` are those in which only camera and register tokens attend among views; for the rest see
         `VGGT`.
         """
-        super().__init__(heads, compute_dtype)
-        self.dense_layers = tuple(dense_layers)
+        super().__init__(heads, dim, dense_layers)
         self.aggregator = Aggregator(dim, depth, num_heads, encoder_depth, encoder_num_heads, register_layers)
         set_matrix_type(self.aggregator, compute_dtype)
         if "camera" in self.heads:

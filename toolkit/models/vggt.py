@@ -19,7 +19,6 @@ from toolkit.models.multiview import (
     Loader,
     MultiView,
     Size,
-    Source,
     Views,
     cameras_from_pose_encoding,
     dense_output,
@@ -36,11 +35,10 @@ from toolkit.models.vit import (
     set_matrix_type,
 )
 
-__all__ = ["HEADS", "MODES", "VGGT", "Views", "cameras_from_pose_encoding", "load_images"]
+__all__ = ["HEADS", "VGGT", "Views", "cameras_from_pose_encoding", "load_images"]
 
 HEADS = ("camera", "depth", "point")
 SIDE = 518
-MODES = ("crop", "pad")
 REGISTERS = 4
 SPECIAL = 1 + REGISTERS
 """Number of tokens of a view before its patches: one camera token, then the registers. (The encoder has the same number
@@ -76,16 +74,12 @@ def _show(image: Image.Image, mode: str) -> Image.Image:
     return resized.crop((0, top, width, min(top + SIDE, height)))
 
 
-LOADER = Loader(MODES, _fit, _show, least=lambda mode: (SIDE, SIDE if mode == "pad" else 0))
+LOADER = Loader(("crop", "pad"), _fit, _show, least=lambda mode: (SIDE, SIDE if mode == "pad" else 0))
+load_images = LOADER.load
+"""Loads images as the official loader does; see `multiview.Loader.load`.
 
-
-def load_images(sources: Sequence[Source], mode: str = "crop") -> Views:
-    """Load images as the official loader does; see `multiview.Loader.load`.
-
-    Resizes images (bicubic, by Pillow) in proportion, to multiples of 14: "crop" makes the width 518 and keeps at most
-    the 518 middle rows; "pad" makes the longer side 518 and adds white up to 518 x 518.
-    """
-    return LOADER.load(sources, mode)
+Resizes images (bicubic, by Pillow) in proportion, to multiples of 14: "crop", the default, makes the width 518 and
+keeps at most the 518 middle rows; "pad" makes the longer side 518 and adds white up to 518 x 518."""
 
 
 class PatchEncoder(Dinov2):
@@ -212,7 +206,7 @@ class VGGT(MultiView):
         dense_channels: Sequence[int] = (256, 512, 1024, 1024),
         dense_features: int = 256,
     ) -> None:
-        """Take the sizes of the network, see `MultiView` for the first two.
+        """Take the sizes of the network, see `MultiView.from_checkpoint` for the first two.
 
         Args:
             dim, depth, num_heads: of the trunk; each of the `depth` layers has two blocks.
@@ -221,8 +215,7 @@ class VGGT(MultiView):
             camera_depth, camera_num_heads: of the camera head.
             dense_layers, dense_channels, dense_features: the four layers that the dense heads read, and their channels.
         """
-        super().__init__(heads, compute_dtype)
-        self.dense_layers = tuple(dense_layers)
+        super().__init__(heads, dim, dense_layers)
         self.aggregator = Aggregator(dim, depth, num_heads, encoder_depth, encoder_num_heads, grid)
         set_matrix_type(self.aggregator, compute_dtype)
         if "camera" in self.heads:

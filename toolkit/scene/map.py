@@ -20,7 +20,7 @@ from toolkit.capture.session import RECONSTRUCTION_RECORD
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_folders, open_descriptors, shows_upright
 from toolkit.embedders.masks import near as within
-from toolkit.embedders.search import VectorIndex, embedder_fingerprint, fused_products, load_index, search
+from toolkit.embedders.search import VectorIndex, embedder_fingerprint, load_index, search
 from toolkit.errors import ArtifactError
 from toolkit.features.features import KINDS, SiftExtractor, usable
 from toolkit.features.matching import (
@@ -80,8 +80,6 @@ from toolkit.scene.query import MapCameras, answer_of, query_from, show_matches,
 from toolkit.threads import fixed_sums
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from toolkit.figures.answers import Answer, Comparison
     from toolkit.viewer.queries import View3D
 
@@ -99,8 +97,8 @@ FEW_REFERENCES = 4
 """How many references, those that support an `ok` pose most, fallback features are matched with at first."""
 MAX_KNOWN = 3
 """Largest number of earlier poses of a query that the fallback features judge, too."""
-MAX_IN_MEMORY = 1 << 30
-"""Largest size in bytes of global descriptors (float64) that an open map keeps in memory; larger ones stay on disk."""
+MAX_IN_MEMORY = 1 << 29
+"""Largest size in bytes of global descriptors (float32) that an open map keeps in memory; larger ones stay on disk."""
 Ranked = tuple[NDArray[np.int64], NDArray[np.float64]]
 """Rows (k,) of map images in their session, best first, and their scores (k,)."""
 
@@ -180,25 +178,21 @@ class Map:
             pairs = [alone]
         localized = last_localized(files, pairs)
         reranked = Path(localized[1][RETRIEVAL]).name == files.reranked_dir.name
-        return replace(cls._stored_in(device, localized, files.features, files.maps), files=files, reranked=reranked)
+        return replace(cls.of_pair(localized, device, files.features, files.maps), files=files, reranked=reranked)
 
     @classmethod
-    def of_pair(cls, poses: str | Path, device: str, features_dir: str | Path, map_dir: str | Path) -> "Map":
+    def of_pair(cls, poses: Path | Localized, device: str, features_dir: Path, map_dir: Path) -> "Map":
         """Open the map of a finished pair, with the settings that the pair was localized with, from the given files.
 
         Args:
-            poses: `poses/<pair>.h5`.
+            poses: `poses/<pair>.h5`, or what `how_localized` returns for it.
             device: the map device.
             features_dir, map_dir: as given to `localize_pairs`.
 
         Raises:
             ArtifactError, WeightsError: as `open`.
         """
-        return cls._stored_in(device, how_localized(Path(poses)), Path(features_dir), Path(map_dir))
-
-    @classmethod
-    def _stored_in(cls, device: str, localized: Localized, features_dir: Path, map_dir: Path) -> "Map":
-        settings, h5_attributes, names = localized
+        settings, h5_attributes, names = how_localized(poses) if isinstance(poses, Path) else poses
         (kinds, escalation), mapped = create_methods(settings), list[MappedFeatures]()
         root = Path(h5_attributes[SESSIONS_ROOT])
         for name, kind in zip(names, kinds if settings.map is not None else (), strict=True):
@@ -281,18 +275,7 @@ class Map:
         """
         return (localizer or self.localizer).match(self._with_features(query).scaled(1 / self.length), references)
 
-    def show_matches(self, matches: QueryMatches, reference: int = 1, image: int = 0) -> "Figure":
-        """Draw the matches by descriptors of one image of a query with one of its references.
-
-        Args:
-            matches: what `match` returned.
-            reference: rank of the reference, from 1.
-            image: number of the query image, from 0.
-
-        Raises:
-            ArtifactError: there is no such image or reference, or the method does not match keypoints.
-        """
-        return show_matches(self, matches, reference, image)
+    show_matches = show_matches
 
     def show_3d(self) -> "View3D":
         """Return the map in 3D: points and cameras; see `QueryResult.show_3d`."""
@@ -416,7 +399,8 @@ class Map:
         `first` is the latest result. `found_by` names the fallback features if the pose was computed with them.
         """
         poses = [first.world_from_rig, *(rival.world_from_rig for rival in first.rivals)]
-        known = [_canonical(pose) for pose in poses[:MAX_KNOWN] if pose is not None]
+        # As read from a file, so that results do not depend on whether the poses were stored.
+        known = [geometry.pose_from_qt(geometry.qt_from_pose(pose)) for pose in poses[:MAX_KNOWN] if pose is not None]
         # The earlier poses are judged by all kinds of features.
         known_priors = [
             Prior(pose, images, SEARCH_DEG[0], "first") for pose in known if len(images := self._images_near(pose))
@@ -425,7 +409,9 @@ class Map:
         result = replace(result, found_by="+".join([result.found_by, *(kind.name for kind in self.escalation)]))
         if first.status is Status.OK:
             result = self._with_rivals_of(first, result)
-        better = result.status.rank >= max(first.status.rank, 1) or self._finds_rival(result)
+        # Not `ok` beside its rivals, even if all else is certain: what was first may be one of them.
+        rivaled = self._beside(1.0, result.rivals) < self.settings.pnp.ok_probability
+        better = result.status.rank >= max(first.status.rank, 1) or (result.status is Status.LOW_CONFIDENCE and rivaled)
         earlier = first.first_seconds
         return replace(
             result if better else first,
@@ -433,11 +419,6 @@ class Map:
             first_seconds=round(first.seconds, 4) if earlier is None else earlier,
             context=first.context,  # it has all references
         )
-
-    def _finds_rival(self, result: QueryResult) -> bool:
-        """Tell whether a pose cannot be `ok` beside its rivals, even if all else is certain."""
-        beside = self._beside(1.0, result.rivals)
-        return result.status is Status.LOW_CONFIDENCE and beside < self.settings.pnp.ok_probability
 
     def _beside(self, probability: float, rivals: Sequence[Rival]) -> float:
         """Return the probability that a pose is correct, bounded by its rivals in this map."""
@@ -537,10 +518,9 @@ class Map:
         if self._unmapped and not settings.predicts:
             return self._on_demand_localizer(self._unmapped)
         if not self.mapped:
-            fault = (
-                f"The map of {self.device!r} was built for another method than {settings.method!r} and has no points"
-            )
-            raise ArtifactError(f"{fault}, which it needs. Localize with {settings.method!r} first.")
+            fault = f"The map of {self.device!r} was built for another method than {settings.method!r}"
+            do = f"Localize with {settings.method!r} first."
+            raise ArtifactError(f"{fault} and has no points, which it needs. {do}")
         pnp = PnpLocalizer(self.in_lengths, settings.pnp, settings.seed)
         if settings.method != "feed_forward":
             for kind in self.in_lengths:
@@ -694,11 +674,6 @@ class Map:
         return {**unit, "text": self.remarks, **asdict(self.consistency)}
 
 
-def _canonical(pose: Floats) -> Floats:
-    """Return a pose (4, 4) as it is read from a file, so that results do not depend on whether it was stored."""
-    return geometry.pose_from_qt(geometry.qt_from_pose(pose))
-
-
 # The references of a query, and what its results need
 
 
@@ -820,18 +795,10 @@ class ReferenceSearch:
 
     def _nearest(self, vector: NDArray[np.float32], k: int, allowed: NDArray[np.bool_] | None) -> Ranked:
         """Return the k map images that are most similar to a vector, with the scores and in the order of `search`."""
-        of_map, rows, dims = self._descriptors, self.rows, self._stored[0].dims
-        if self._index is not None or isinstance(of_map, Vectors):
-            found = search(vector[None], of_map, k, "torch", "cpu", index=self._index, allowed=allowed, dims=dims)
-            scores, nearest = (of_vector[0, found[1][0] >= 0] for of_vector in found)
-            return rows[nearest], scores.astype(np.float64)
-        products = fused_products(vector.astype(np.float64), of_map, dims, lambda a, b: np.einsum("nd,d->n", b, a))
-        scores = products.astype(np.float32)
-        if not np.isfinite(scores).all():
-            raise ValueError("The descriptors of the query or of the map have NaN or infinite values.")
-        candidates = np.arange(len(rows)) if allowed is None else np.flatnonzero(allowed)
-        nearest = candidates[np.argsort(-scores[candidates], kind="stable")[:k]]
-        return rows[nearest], scores[nearest].astype(np.float64)
+        dims = self._stored[0].dims
+        found = search(vector[None], self._descriptors, k, index=self._index, allowed=allowed, dims=dims)
+        scores, nearest = (of_vector[0, found[1][0] >= 0] for of_vector in found)
+        return self.rows[nearest], scores.astype(np.float64)
 
     def _rerank(self, ranked: Ranked, view: View) -> Ranked:
         """Return rows of map images and their numbers of verified matches, most first, as the rerank stage does."""
@@ -867,14 +834,8 @@ class ReferenceSearch:
         """The embedders that the run used; ArtifactError is raised if the map's vectors are from another one."""
         settings = self.embed_settings
         folders = embedding_folders(self.files.embeddings).values()
-        learned = {
-            "checkpoint": settings.checkpoint,
-            "device": settings.compute_device,
-            "dtype_compute": settings.dtype_compute,
-            "image_size": settings.image_size,
-        }
         embedders = [
-            create_embedder(name, **({"vocabulary": folder / "vlad.npz"} if name == "vlad" else learned))
+            create_embedder(name, **({"vocabulary": folder / "vlad.npz"} if name == "vlad" else settings.of_network))
             for name, folder in zip(settings.models, folders, strict=True)
         ]
         for embedder, vectors in zip(embedders, self._stored[0].parts.values(), strict=True):
@@ -893,11 +854,11 @@ class ReferenceSearch:
         return vectors.choose(np.flatnonzero(posed)), rows[posed]
 
     @cached_property
-    def _descriptors(self) -> Floats | Vectors:
+    def _descriptors(self) -> NDArray[np.float32] | Vectors:
         """Those of `_stored`, in memory unless the map is large."""
         vectors = self._stored[0]
-        in_memory = np.dtype(np.float64).itemsize * vectors.shape[1] * len(vectors) < MAX_IN_MEMORY
-        return vectors[:].astype(np.float64) if in_memory else vectors
+        in_memory = np.dtype(np.float32).itemsize * vectors.shape[1] * len(vectors) < MAX_IN_MEMORY
+        return vectors[:] if in_memory else vectors
 
     @cached_property
     def _index(self) -> VectorIndex | None:

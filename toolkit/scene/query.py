@@ -473,16 +473,25 @@ def _in(other: Map, scene_map: Map, references: References) -> References:
     return References(indices, references.scores).take(indices >= 0)
 
 
-def show_matches(scene_map: Map, matches: QueryMatches, rank: int, image: int) -> "Figure":
-    """Draw the matches by descriptors of one image of a query with one of its references; see `Map.show_matches`."""
+def show_matches(scene_map: Map, matches: QueryMatches, reference: int = 1, image: int = 0) -> "Figure":
+    """Draw the matches by descriptors of one image of a query with one of its references.
+
+    Args:
+        matches: what `Map.match` returned.
+        reference: rank of the reference, from 1.
+        image: number of the query image, from 0.
+
+    Raises:
+        ArtifactError: there is no such image or reference, or the method does not match keypoints.
+    """
     from toolkit.figures.query_images import draw_pair
 
     found = matches.references[image].images.tolist() if 0 <= image < len(matches.references) else list[int]()
-    if not isinstance(matches, PnpMatches) or not 0 < rank <= len(found) or image not in matches.usable:
+    if not isinstance(matches, PnpMatches) or not 0 < reference <= len(found) or image not in matches.usable:
         known = f"an image with features from 0 to {len(matches.references) - 1}, a reference from 1 to {len(found)}"
         expected = f"{known}, and a method that matches keypoints"
-        raise ArtifactError.at(f"image {image}, reference {rank}", "no matches", expected)
-    at, index, matcher = matches.usable.index(image), found[rank - 1], matches.localizer.matcher
+        raise ArtifactError.at(f"image {image}, reference {reference}", "no matches", expected)
+    at, index, matcher = matches.usable.index(image), found[reference - 1], matches.localizer.matcher
     alone = [References.of([index] if number == at else []) for number in range(len(matches.usable))]
     of_pair = matches.with_references(alone)
     seen, pixels = matcher.keypoints(index, of_pair.point)
@@ -495,6 +504,6 @@ def show_matches(scene_map: Map, matches: QueryMatches, rank: int, image: int) -
         agrees = np.ones(len(seen), bool)
         return ShownImage(name, file, camera, np.eye(4), at, points, both, agrees, found_by=ways)
 
-    reference = shown(name, scene_map.session.image_path(row), scene_map.session.cameras([row])[0], pixels)
+    of_map = shown(name, scene_map.session.image_path(row), scene_map.session.cameras([row])[0], pixels)
     query = shown(view.name, view.image, view.camera, of_pair.pixels[seen])
-    return draw_pair(query, reference, f"{len(seen)} matches by descriptors with reference {rank}")
+    return draw_pair(query, of_map, f"{len(seen)} matches by descriptors with reference {reference}")

@@ -68,7 +68,7 @@ class StoredQueries:
         self.session = session
         self.references = {
             (int(row["timestamp"]), str(row["sensor_id"])): [
-                (image_name(hit["path"]), float(hit["score"])) for hit in row["topk"]
+                (image_name(hit["path"]), float(hit.get("score", np.nan))) for hit in row["topk"]
             ]
             for row in read_references(retrieval)
         }
@@ -215,20 +215,16 @@ class InspectedPair:
         return stored
 
     @cached_property
-    def _topk(self) -> dict[tuple[int, str], list[dict[str, Any]]]:
+    def _references(self) -> dict[tuple[int, str], list[tuple[str, float]]]:
         with suppress(ArtifactError):  # poses can be inspected without the retrieval that they were made from
             require_current(self._h5.with_suffix(".txt"), "localize", (".jsonl",))
-            rows = read_references(self.retrieval)
-            return {(int(row["timestamp"]), str(row["sensor_id"])): row["topk"] for row in rows}
+            return StoredQueries(self.localized.query_session, self.retrieval).references
         return {}
 
     def _retrieved(self, number: int) -> dict[str, tuple[int, float]]:
         images = self.localized.query_session.images.iloc[self.localized.rows[number]]
         keys = zip(images["timestamp"].tolist(), images["sensor_id"].astype(str).tolist(), strict=True)
-        return best_ranks(
-            [(image_name(hit["path"]), float(hit.get("score", np.nan))) for hit in self._topk.get(key, [])]
-            for key in keys
-        )
+        return best_ranks(self._references.get(key, []) for key in keys)
 
 
 class WorstQueries:
