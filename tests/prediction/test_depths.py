@@ -42,10 +42,10 @@ def plain(rng: np.random.Generator, h: int, w: int, ppm: float) -> NDArray[np.ui
 def furnished() -> Scene:
     """A wall, a floor, and two boards before the wall."""
     scene = Scene(np.zeros(3), (12.0, 12.0, 6.0), False)
-    scene.plate((-5, 4, 4), (1, 0, 0), (0, 0, -1), 10, 4, plain, 16, lit=False)
-    scene.plate((-5, 4, 0), (1, 0, 0), (0, -1, 0), 10, 8, plain, 16, lit=False)
-    scene.plate((-1.2, 2.5, 2.4), (1, 0, 0), (0, 0, -1), 0.8, 1.2, plain, 16, lit=False)
-    scene.plate((0.3, 3.0, 2.0), (0.8, 0.6, 0), (0, 0, -1), 1.0, 1.5, plain, 16, lit=False)
+    scene.plate((-5, 4, 4), (1, 0, 0), (0, 0, -1), 10, 4, plain, 16)
+    scene.plate((-5, 4, 0), (1, 0, 0), (0, -1, 0), 10, 8, plain, 16)
+    scene.plate((-1.2, 2.5, 2.4), (1, 0, 0), (0, 0, -1), 0.8, 1.2, plain, 16)
+    scene.plate((0.3, 3.0, 2.0), (0.8, 0.6, 0), (0, 0, -1), 1.0, 1.5, plain, 16)
     for number in range(len(scene.quads)):
         paint(scene, 0, 0, number)
     return scene

@@ -37,7 +37,7 @@ from toolkit.synthetic.capture import (
     scans,
     walks,
 )
-from toolkit.synthetic.render import Quad, Rays, Scene, build_room, paint, render
+from toolkit.synthetic.render import Quad, Rays, Scene, build_room, named_rng, paint, render
 
 
 def coarse_room(seed: int, index: int, look: int | None = None) -> Scene:
@@ -65,7 +65,7 @@ def checker(rng: np.random.Generator, h: int, w: int, ppm: float) -> np.ndarray:
 def looking_at_wall() -> tuple[Scene, np.ndarray]:
     """A wall of 3.2 x 3.2 m with squares of 0.2 m, and a camera that sees it askew."""
     scene = Scene(np.zeros(3), (9.0, 9.0, 9.0), False)
-    scene.plate((-1.6, 4.0, 1.6), (1, 0, 0), (0, 0, -1), 3.2, 3.2, checker, 160, lit=False)
+    scene.plate((-1.6, 4.0, 1.6), (1, 0, 0), (0, 0, -1), 3.2, 3.2, checker, 160)
     paint(scene, 0, 0, 0)
     return scene, make_pose(looking(76.0, 4.0, 9.0), (-0.3, 0.4, 0.1))
 
@@ -98,8 +98,8 @@ def test_texture_corners_appear_where_the_camera_projects_them(sensor: Sensor) -
 
 def test_rectangles_behind_and_across_the_camera_are_clipped() -> None:
     scene = Scene(np.zeros(3), (9.0, 9.0, 9.0), False)
-    scene.plate((-4, 4, 0), (1, 0, 0), (0, -1, 0), 8, 8, checker, 60, lit=False)  # the floor, also behind
-    scene.plate((4, -3, 2), (-1, 0, 0), (0, 0, -1), 8, 2, checker, 60, lit=False)  # a wall behind
+    scene.plate((-4, 4, 0), (1, 0, 0), (0, -1, 0), 8, 8, checker, 60)  # the floor, also behind
+    scene.plate((4, -3, 2), (-1, 0, 0), (0, 0, -1), 8, 2, checker, 60)  # a wall behind
     for number in range(2):
         paint(scene, 0, 0, number)
     camera = pycolmap.Camera(model="PINHOLE", width=96, height=72, params=[70, 70, 48, 36])
@@ -115,7 +115,7 @@ def test_rectangles_behind_and_across_the_camera_are_clipped() -> None:
 def test_the_nearer_rectangle_hides_the_farther() -> None:
     scene, world_from_cam = looking_at_wall()
     plain = partial(textures.plain, color=(0, 0, 255))
-    scene.plate((-0.2, 2.0, 0.6), (1, 0, 0), (0, 0, -1), 0.5, 0.5, plain, 100, lit=False)
+    scene.plate((-0.2, 2.0, 0.6), (1, 0, 0), (0, 0, -1), 0.5, 0.5, plain, 100)
     paint(scene, 0, 0, 1)
     camera = pycolmap.Camera(model="PINHOLE", width=320, height=240, params=[260, 260, 160, 120])
     picture, depth = render(scene.quads, world_from_cam, Rays.of(camera), gray=False)
@@ -123,6 +123,21 @@ def test_the_nearer_rectangle_hides_the_farther() -> None:
     column, row = np.asarray(camera.img_from_cam(middle))[0].astype(int)
     assert picture[row, column].tolist() == [0, 0, 255]
     assert depth[row, column] == pytest.approx(middle[0, 2], abs=0.02)
+
+
+def test_the_brightness_of_a_rectangle_follows_from_its_normal_but_lamps_and_the_sky_shine() -> None:
+    gray = partial(textures.plain, color=(100, 100, 100))
+    floor, ceiling = ((1, 0, 0), (0, -1, 0)), ((1, 0, 0), (0, 1, 0))
+    to_x, to_y = ((0, 1, 0), (0, 0, -1)), ((-1, 0, 0), (0, 0, -1))  # normals x and y
+    for (right, down), brightness in {floor: 1.0, ceiling: 0.7, to_x: 0.93, to_y: 0.7}.items():
+        scene = Scene(np.zeros(3), (9.0, 9.0, 9.0), False)
+        for material in (gray, textures.lamp, textures.clouds):
+            scene.plate((3, 2, 1), right, down, 1, 1, material, 64)
+            paint(scene, 0, 0, len(scene.quads) - 1)
+        plain, lamp, sky = (quad.color[0] for quad in scene.quads)
+        assert np.unique(plain).tolist() == [round(100 * brightness)]
+        assert lamp[32, 32].tolist() == [250, 250, 250]
+        assert np.array_equal(sky, textures.clouds(named_rng(0, 0, "quad", 2), 64, 64, 64))
 
 
 def test_two_views_agree_through_depth_and_poses(small_capture: Path) -> None:
@@ -313,7 +328,7 @@ def render_bare(out: Path, *given: int, **more: Any) -> Path:
 
     def bare_room(seed: int, index: int, look: int | None = None) -> Scene:
         scene = build_room(seed, index, look)
-        del scene.quads[1:], scene.blockers[:]
+        del scene.quads[1:]
         scene.quads[0].ppm = 20
         return scene
 

@@ -46,7 +46,7 @@ PATH_LOSS, WALL_DB, FADING_DB, MIN_DBM = 2.5, 6.9, 3.0, -92.0
 """Path-loss exponent (log-distance model: T. S. Rappaport, Wireless Communications, 2002), loss per wall (COST 231
 multi-wall model), standard deviation of a reading, and the level below which nothing is received."""
 RADIOS = {"ios": ("bt",), "hl": ("wifi", "bt"), "spot": ("wifi", "bt")}  # iOS does not let an app scan WiFi
-FORMAT = 3  # increase it when the same settings produce other bytes
+FORMAT = 4  # increase it when the same settings produce other bytes
 WRONG_FOCAL = 1.12  # clearly wrong, and still localizable
 
 

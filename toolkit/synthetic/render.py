@@ -1,5 +1,4 @@
-"""The rooms of the rendered capture: textured rectangles with the light of their room's lamps, rendered to an image
-with exact depth.
+"""The rooms of the rendered capture: textured rectangles, rendered to an image with exact depth.
 
 Each pixel has four samples. The ray of each sample, from the camera model with its distortion, is intersected with the
 rectangles; the nearest one gives the color, read from its texture at the mip level of the sample's footprint.
@@ -20,12 +19,13 @@ from numpy.typing import NDArray
 
 from toolkit.geometry import Floats
 from toolkit.synthetic import textures as tex
-from toolkit.synthetic.textures import Image, Material, Rng, in_color
+from toolkit.synthetic.textures import Image, Material, Rng
 
 if TYPE_CHECKING:
     import pycolmap
 
 UP = np.array([0.0, 0.0, 1.0])
+TO_LIGHT = np.array([0.08, -0.15, 0.15])  # the brightness of a rectangle is 0.85 + normal @ TO_LIGHT
 Place = tuple[float, float, float]  # position and heading of a box in its room: x, y (meters), yaw (radians)
 BRICK = [(62, 84, 158), (70, 96, 172), (54, 70, 132), (84, 112, 182)]
 SANDSTONE = [(150, 185, 205), (138, 172, 195), (162, 196, 214), (120, 155, 180)]
@@ -70,7 +70,7 @@ def named_rng(*key: int | str) -> Rng:
 class Quad:
     """A textured rectangle, given by the top-left corner of its texture and the texture's unit axes in the world frame.
 
-    Lengths are in meters; `ppm` is the texture's resolution, pixels per meter; `lit` is False for lamps and sky.
+    Lengths are in meters; `ppm` is the texture's resolution, pixels per meter.
     """
 
     corner: Floats
@@ -80,7 +80,6 @@ class Quad:
     height: float
     material: Material
     ppm: float
-    lit: bool = True
     color: list[Image] = field(default_factory=list)  # mip levels, BGR; [0] is the finest
     gray: list[Image] = field(default_factory=list)
 
@@ -98,36 +97,23 @@ class Quad:
 
 @dataclass
 class Scene:
-    """The rectangles of one room, its boxes (which block light), and its lamps."""
+    """The rectangles of one room."""
 
     origin: Floats
     size: tuple[float, float, float]
     outdoor: bool
     quads: list[Quad] = field(default_factory=list)
-    blockers: list[tuple[Floats, Floats, float]] = field(default_factory=list)  # center, half sizes, yaw
-    lamps: list[Floats] = field(default_factory=list)
-
-    @cached_property
-    def blocker_bounds(self) -> tuple[Floats, Floats]:
-        """Lower and upper corners (N, 3) of axis-aligned bounding boxes of the blockers. Use it on finished scenes."""
-        centers = np.array([center for center, _, _ in self.blockers]).reshape(-1, 3)
-        halves = np.array([half for _, half, _ in self.blockers]).reshape(-1, 3)
-        radius = np.hypot(halves[:, 0], halves[:, 1])  # bounds x and y for any yaw
-        extent = np.stack([radius, radius, halves[:, 2]], -1)
-        return centers - extent, centers + extent
 
     def plate(
-        self, corner: Any, right: Any, down: Any, width: float, height: float, material: Material,
-        ppm: float = 300.0, lit: bool = True,
-    ) -> None:  # fmt: skip
+        self, corner: Any, right: Any, down: Any, width: float, height: float, material: Material, ppm: float = 300.0
+    ) -> None:
         """Add one rectangle; `corner` is relative to the room's origin."""
         axes = np.asarray(right, float), np.asarray(down, float)
-        self.quads.append(Quad(self.origin + np.asarray(corner, float), *axes, width, height, material, ppm, lit))
+        self.quads.append(Quad(self.origin + np.asarray(corner, float), *axes, width, height, material, ppm))
 
     def box(
         self, place: Place, z: float, size: tuple[float, float, float], front: Material,
-        side: Material | None = None, top: Material | None = None, ppm: float = 350.0, lit: bool = True,
-        back: bool = True,
+        side: Material | None = None, top: Material | None = None, ppm: float = 350.0, back: bool = True,
     ) -> None:  # fmt: skip
         """Add a box of `size` (width, depth, height) with its base at height z; its front faces +y rotated by yaw."""
         x, y, yaw = place
@@ -141,13 +127,11 @@ class Scene:
         for normal, reach, half_width, material in sides:
             right = np.cross(UP, normal)
             corner = center + normal * reach - right * half_width + UP * half[2]
-            self.plate(corner, right, -UP, 2 * half_width, size[2], material, ppm, lit)
+            self.plate(corner, right, -UP, 2 * half_width, size[2], material, ppm)
         # Top, and the underside if it is visible.
         for sign in (1, -1) if z > 0.1 else (1,):
             corner = center - axis_x * half[0] + sign * (axis_y * half[1] + UP * half[2])
-            self.plate(corner, axis_x, -sign * axis_y, size[0], size[1], top or side or front, ppm, lit)
-        if min(size) > 0.05 and lit:
-            self.blockers.append((self.origin + center, half, yaw))
+            self.plate(corner, axis_x, -sign * axis_y, size[0], size[1], top or side or front, ppm)
 
     def at_wall(self, wall: int, along: float, depth: float) -> Place:
         """Return the place of a box of this depth against a wall, `along` meters from the middle of the wall."""
@@ -281,8 +265,7 @@ def build_room(seed: int, index: int, look: int | None = None) -> Scene:
     floor = _cells(*kind["floor"], jitter=0.15, motifs=kind["floor"][3] == "none")
     scene.plate((-w / 2, d / 2, 0), (1, 0, 0), (0, -1, 0), w, d, floor, 256)
     if outdoor:
-        scene.plate((-150, -150, 40), (1, 0, 0), (0, 1, 0), 300, 300, tex.clouds, 4, lit=False)  # the sky
-        scene.lamps = [scene.origin + np.array([9.0 + 2 * i, -14.0, 22.0]) for i in (-0.5, 0.5)]
+        scene.plate((-150, -150, 40), (1, 0, 0), (0, 1, 0), 300, 300, tex.clouds, 4)  # the sky
     else:
         ceiling = partial(tex.cells, size=(0.6, 0.6), colors=[(215, 222, 225)], stagger="none", jitter=0.03)
         scene.plate((-w / 2, -d / 2, h), (1, 0, 0), (0, 1, 0), w, d, ceiling, 160)
@@ -291,8 +274,7 @@ def build_room(seed: int, index: int, look: int | None = None) -> Scene:
             scene.box((x, 0, 0), h - 0.24, (0.18, d, 0.24), beam, ppm=160)
         for x in (-w / 4 * 1.5, 0.12 * w, w / 4 * 1.5):
             for y in (-d / 5, d / 5):
-                scene.box((x, y, 0), h - 0.04, (0.9, 0.25, 0.04), tex.lamp, lit=False, ppm=120)
-                scene.lamps.append(origin + np.array([x, y, h - 0.08]))
+                scene.box((x, y, 0), h - 0.04, (0.9, 0.25, 0.04), tex.lamp, ppm=120)
     for k in range(4):
         _furnish_wall(scene, rng, k, kind["things"])
     _furnish_middle(scene, rng)
@@ -330,87 +312,20 @@ def _furnish_middle(scene: Scene, rng: Rng) -> None:
         angle = yaw + i * 2.1
         x, y, z = 0.24 * w * np.cos(angle), 0.24 * d * np.sin(angle), min(h, 3.4) - rng.uniform(0.7, 0.9)
         scene.box((x, y, angle), z, (0.45, 0.45, 0.3), [tex.cloth, tex.poster, tex.painting][i], ppm=300)
-        scene.box((x, y, angle), z + 0.3, (0.02, 0.02, h - z - 0.3), tex.lamp, lit=False)
+        scene.box((x, y, angle), z + 0.3, (0.02, 0.02, h - z - 0.3), tex.lamp)
 
 
 # Painting and rendering
 
 
-def _blocked(scene: Scene, start: Image, way: Image) -> NDArray[np.bool_]:
-    """Return which segments start + t * way, t in (0, 1), (N, 3) each, intersect a box of the scene (slab test)."""
-    hit = np.zeros(len(start), bool)
-    if not len(start):
-        return hit
-    ends = np.concatenate([start, start + way])
-    lows, highs = scene.blocker_bounds
-    near = ((highs >= ends.min(0)) & (lows <= ends.max(0))).all(1)
-    for k in np.flatnonzero(near):
-        center, half, yaw = scene.blockers[k]
-        c, s = np.float32(np.cos(yaw)), np.float32(np.sin(yaw))
-        px, py, pz = (start - center.astype(np.float32)).T
-        vx, vy, vz = way.T
-        enter, leave = np.zeros(len(start), np.float32), np.ones(len(start), np.float32)
-        for origin, along, side in (
-            (c * px + s * py, c * vx + s * vy, half[0]), (c * py - s * px, c * vy - s * vx, half[1]),
-            (pz, vz, half[2]),
-        ):  # fmt: skip
-            inverse = 1 / np.where(np.abs(along) < 1e-6, np.float32(1e-6), along)
-            middle, spread = -origin * inverse, np.abs(np.float32(side) * inverse)
-            np.maximum(enter, middle - spread, out=enter)
-            np.minimum(leave, middle + spread, out=leave)
-        hit |= enter < leave
-    return hit
-
-
-def _light(scene: Scene, quad: Quad) -> Image:
-    """Return the light on a rectangle as a coarse float32 image: lamps with shadows, and ambient occlusion."""
-    rows, columns = max(2, round(quad.height / 0.15)), max(2, round(quad.width / 0.15))
-    t, s = np.mgrid[0:rows, 0:columns] + 0.5
-    points = quad.corner + (s.ravel() * quad.width / columns)[:, None] * quad.right
-    points = points + (t.ravel() * quad.height / rows)[:, None] * quad.down + 0.02 * quad.normal
-    points = points.astype(np.float32)
-    # Cosine-weighted directions over the hemisphere (Lambert's law), on a spiral with the golden angle.
-    i = np.arange(14) + 0.5
-    radius, angle = np.sqrt(i / 14), i * 2.399963
-    local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - i / 14)], -1)
-    ways = (1.3 * local @ np.stack([quad.right, quad.down, quad.normal])).astype(np.float32)
-    w, d, h = scene.size
-    low = scene.origin - np.array([w / 2, d / 2, 0])
-    high = scene.origin + np.array([w / 2, d / 2, 99 if scene.outdoor else h])
-    starts, ways = np.repeat(points, len(ways), 0), np.tile(ways, (len(points), 1))
-    ends = starts + ways
-    closed = ((ends < low) | (ends > high)).any(1)
-    inside = np.flatnonzero(~closed)
-    closed[inside] = _blocked(scene, starts[inside], ways[inside])
-    lit = (0.62 if scene.outdoor else 0.58) * (1 - 0.65 * closed.reshape(len(points), -1).mean(1))
-    offsets = np.array([[0, 0], [0.35, 0.1], [-0.35, -0.1]], np.float32) * (1.5 if scene.outdoor else 1.0)
-    lit_by, ways_to = [], []
-    for lamp_at in scene.lamps:
-        for dx, dy in offsets:
-            way = (lamp_at + np.array([dx, dy, 0]) - points).astype(np.float32)
-            distance = np.linalg.norm(way, axis=1)
-            cosine = np.clip(way @ quad.normal.astype(np.float32) / distance, 0, 1)
-            if not cosine.any():
-                continue
-            fall = 0.85 / len(scene.lamps) if scene.outdoor else 1.5 / len(scene.lamps) * 6 / (distance**2 + 3.0)
-            lit_by.append(fall * cosine / len(offsets))
-            ways_to.append(way)
-    if ways_to:  # one call for all lamps, because most rectangles have few points
-        blocked = _blocked(scene, np.tile(points, (len(ways_to), 1)), np.concatenate(ways_to))
-        for light, shadow in zip(lit_by, blocked.reshape(len(ways_to), -1), strict=True):
-            lit = lit + light * ~shadow
-    return cv2.GaussianBlur(lit.reshape(rows, columns).astype(np.float32), (3, 3), 0)
-
-
 def paint(scene: Scene, seed: int, index: int, number: int) -> None:
-    """Make the texture of rectangle `number` of room `index`, with light baked in, and its mip levels."""
+    """Make the texture of rectangle `number` of room `index`, shaded by its normal, and its mip levels."""
     quad = scene.quads[number]
     multiple = 2 ** (LEVELS - 1)
     h, w = (max(multiple, round(side * quad.ppm / multiple) * multiple) for side in (quad.height, quad.width))
     image = quad.material(named_rng(seed, index, "quad", number), h, w, quad.ppm)
-    if quad.lit:
-        light = cv2.resize(_light(scene, quad), (w, h), interpolation=cv2.INTER_LINEAR)
-        image = cv2.multiply(image, in_color(light), dtype=cv2.CV_8U)
+    if quad.material not in (tex.lamp, tex.clouds):
+        image = cv2.convertScaleAbs(image, alpha=0.85 + float(quad.normal @ TO_LIGHT))
     for pyramid, level in ((quad.color, image), (quad.gray, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))):
         pyramid.append(level)
         for _ in range(LEVELS - 1):
@@ -555,6 +470,6 @@ def _depth(quads: list[Quad], owner: Image, nearest: Image) -> Image:
         low, high, total = np.minimum(low, sample), np.maximum(high, sample), total + sample
     mean = total / SAMPLES**2
     depth = np.where(low > 0.97 * high, 1 / np.maximum(mean, 1e-6), 0).astype(np.float32)
-    sky = np.array([not quad.lit and quad.ppm < 10 for quad in quads] + [True])
+    sky = np.array([quad.material is tex.clouds for quad in quads] + [True])
     depth[sky[owner[::SAMPLES, ::SAMPLES]]] = 0
     return depth
