@@ -417,7 +417,7 @@ def _write_tables(folder: Path, capture: str, part: _Subsession, failed: dict[in
     if failed:
         log.warning("%s/%s: %d of %d images cannot be read, see %s",
                     session.id, part.name, len(failed), len(table), unreadable)  # fmt: skip
-        write_text(unreadable, table[table["reason"] != ""].to_csv(index=False))
+        write_text(unreadable, table[table["reason"] != ""].to_csv(index=False, lineterminator="\n"))
     else:
         unreadable.unlink(missing_ok=True)
     embedded = table[table["reason"] == ""].drop(columns="reason").reset_index(drop=True)

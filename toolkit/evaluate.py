@@ -271,7 +271,7 @@ def write_evaluation(
             continue
         written.append(path)
         if isinstance(content, pd.DataFrame):
-            write_text(path, content.to_csv(index=False))
+            write_text(path, content.to_csv(index=False, lineterminator="\n"))
         else:
             save_figure(content, path)
     write_sidecar(out / "recall.csv", settings, written[1:], made_from=sources, captured=truths)

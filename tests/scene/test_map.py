@@ -63,7 +63,7 @@ def scripted_map(
 ) -> Map:
     """Return a map with these localizers; `near`: indices of the map images that may show a pose, by its x."""
     scene_map = Map("ios", Path(), Path(), LocalizeSettings(unit="m"), escalation=kinds)
-    vars(scene_map).update(localizer=first, fallback=fallback)
+    vars(scene_map).update(localizer=first, fallback=fallback, estimated_cameras=set())
     vars(scene_map)["_images_near"] = lambda pose: np.array((near or {}).get(pose[0, 3], []), np.int64)
     return scene_map
 
