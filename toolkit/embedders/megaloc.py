@@ -17,7 +17,7 @@ from toolkit.files import Remade
 from toolkit.models.compute import Fitting, is_out_of_memory, on_device, resolve_device, resolve_precision, upload
 from toolkit.models.megaloc import PATCH, MegaLoc
 from toolkit.models.vit import normalized
-from toolkit.models.weights import MEGALOC, given_or_resolved, weights_digest
+from toolkit.models.weights import MEGALOC, resolve_weights, weights_digest
 
 
 class MegaLocEmbedder(Remade):
@@ -51,7 +51,7 @@ class MegaLocEmbedder(Remade):
         self.min_side = 2 * image_size
         self._device = resolve_device(device)
         self._dtype = resolve_precision(dtype_compute, self._device)
-        weights: Path | Mapping[str, Tensor] | MegaLoc = given_or_resolved(MEGALOC, checkpoint)
+        weights: Path | Mapping[str, Tensor] | MegaLoc = resolve_weights(MEGALOC, checkpoint)
         # Copy the caller's network: its type and device must not change.
         model = deepcopy(weights) if isinstance(weights, MegaLoc) else MegaLoc.from_checkpoint(weights)
         self._weights = weights_digest(model)

