@@ -441,3 +441,33 @@ def test_a_killed_command_goes_on_from_its_model(
 def test_the_command_line_explains_what_is_missing(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["reconstruct", str(tmp_path)])
     assert isinstance(result.exception, ManifestError)
+
+
+def synthetic_model(center: tuple[float, float], noise_px: float) -> tuple[Any, pycolmap.Reconstruction]:
+    """Return a model of points all around cameras with this principal point, which say that it is in the middle."""
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=2, num_frames_per_rig=10, num_points3D=400)
+    options.camera_params = [1280.0, *center, 0.0]
+    model, rng = pycolmap.synthesize_dataset(options), np.random.default_rng(0)
+    for image in model.images.values():
+        for point in image.points2D:
+            point.xy = point.xy + rng.normal(0, noise_px, 2)
+    for camera in model.cameras.values():
+        camera.principal_point_x, camera.principal_point_y = 512, 384
+    work = object.__new__(module._Work)
+    work.known, work.camera_ids, work.cameras = set(), [*model.cameras], [*model.cameras.values()]
+    return work, model
+
+
+def test_principal_points_move_to_where_they_fit_but_not_far_from_the_middle_of_the_image() -> None:
+    for center, low, high in (((518.0, 380.0), 0.85, 1.05), ((612.0, 384.0), 0.2, 0.95)):
+        work, model = synthetic_model(center, 0.3)
+        work._refine(model)
+        way = np.subtract(center, (512, 384))
+        for camera in model.cameras.values():
+            moved = np.array([camera.principal_point_x - 512, camera.principal_point_y - 384])
+            assert low < moved @ way / (way @ way) < high
+    work, model = synthetic_model((518.0, 380.0), 0.3)
+    work.known = {0, 1}  # given intrinsics stay
+    work._refine(model)
+    assert {tuple(camera.params[1:3]) for camera in model.cameras.values()} == {(512.0, 384.0)}

@@ -55,6 +55,7 @@ from toolkit.files import (
 )
 from toolkit.geometry import Floats, Ints, unit
 from toolkit.manifest import LocalizeSettings, SiftSettings
+from toolkit.pose.base import CELLS
 from toolkit.scene.query import FOCAL_PRIOR
 from toolkit.store.items import Items, retry_damaged
 from toolkit.threads import one_thread
@@ -73,6 +74,7 @@ LOSS_PX, MAX_ERROR_PX, MIN_ANGLE_DEG = 0.5, 4.0, 1.5
 """Of the last bundle adjustment: scale of the Cauchy loss and largest error of an observation, in pixels of the image
 where features are detected, and smallest triangulation angle."""
 FEW_PAIRS, STRONGEST = 100, 2048  # if there are more pairs, only so many SIFT features of each image are matched
+CENTER_STD = 5e-3  # of principal points around the centers of images, in focal lengths; few are more than 1 % off
 MAPPED_NOISE_M = 0.2  # of the positions of rough poses in COLMAP's mapper, whose loss is robust; drift adds to noise
 MAX_VIEW_DEG = 60.0  # largest angle between the optical axes of images that are neighbors by rough poses
 MIN_POINTS = 30  # points of an image in a model; COLMAP requires as many when it estimates a pose
@@ -375,7 +377,9 @@ class _Work:
         for number in self.known:
             if (camera_id := self.camera_ids[number]) in model.cameras:
                 model.cameras[camera_id].params = self.cameras[number].params.tolist()
-        for _ in range(2):
+        for centered in (False, True):
+            if centered and not fixed:
+                self._move_centers(model)
             pycolmap.create_default_bundle_adjuster(self._adjustment(), self._of_model(model, fixed), model).solve()
             pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX * scale, MIN_ANGLE_DEG)
             for frame in list(model.frames.values()):  # a wrong pose keeps few points
@@ -383,6 +387,35 @@ class _Work:
                 few = sum(image.num_points3D for image in images) < MIN_POINTS
                 if frame.has_pose and few and not any(image.image_id in fixed for image in images):
                     model.deregister_frame(frame.frame_id)
+
+    def _move_centers(self, model: pycolmap.Reconstruction) -> None:
+        """Move the principal points, all by one share of the way to where they fit the observations best.
+
+        The share minimizes the squared errors, which grow with the square of the rest of the way, plus a normal prior
+        around the image centers (`CENTER_STD`). Errors in one cell of an image are alike, for what the camera model
+        lacks, so those of a cell count as one: without this, principal points go where they imitate such errors.
+        """
+        observations = cells = 0
+        for image in map(model.image, model.reg_image_ids()):
+            xy = np.array([point.xy for point in image.points2D if point.has_point3D()]).reshape(-1, 2)
+            camera = model.cameras[image.camera_id]
+            in_cells = (CELLS * xy / (camera.width, camera.height)).astype(int)
+            observations, cells = observations + len(xy), cells + len(np.unique(in_cells, axis=0))
+        cameras = list(model.cameras.values())
+        before, focals_px = _centers(cameras), np.array([[camera.mean_focal_length()] for camera in cameras])
+        options = self._adjustment()
+        options.refine_principal_point = True
+        options.ceres.solver_options.max_num_iterations = 15
+        solver: Any = pycolmap.create_default_bundle_adjuster(options, self._of_model(model), model)
+        costs = solver.solve().ceres_summary
+        freedom = 2 * observations - 3 * model.num_points3D() - 6 * model.num_reg_images()
+        variance = max(2 * costs.final_cost / max(freedom, 1) * observations / max(cells, 1), 1e-12)
+        gain, std = 2 * (costs.initial_cost - costs.final_cost) / variance, CENTER_STD * focals_px
+        way = (_centers(cameras) - before) / std
+        from_middle = (before - np.array([(camera.width / 2, camera.height / 2) for camera in cameras])) / std
+        share = np.clip((gain - (from_middle * way).sum()) / max(gain + (way**2).sum(), 1e-12), 0, 1)
+        for camera, (x, y) in zip(cameras, before + share * way * std, strict=True):
+            camera.principal_point_x, camera.principal_point_y = x, y
 
     @property
     def _image_scale(self) -> float:
@@ -411,6 +444,11 @@ class _Work:
         for camera_id in kept & {model.image(number).camera_id for number in model.reg_image_ids()}:
             config.set_constant_cam_intrinsics(camera_id)
         return config
+
+
+def _centers(cameras: Sequence[pycolmap.Camera]) -> Floats:
+    """Return the principal points (C, 2) of cameras, pixels."""
+    return np.array([(camera.principal_point_x, camera.principal_point_y) for camera in cameras])
 
 
 @contextmanager
