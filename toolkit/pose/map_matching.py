@@ -543,7 +543,7 @@ def with_own_focals(query: Query, result: QueryResult, max_error_deg: float) -> 
 
     Each focal length has a normal prior around the stated one, see `OWN_FOCAL_STD`. Errors in a cell of an image are
     alike, so correspondences count as many as there are cells with one. A result that says that the intrinsics are
-    wrong, or has no pose, is returned as it is. The covariance grows to cover the first pose.
+    wrong, or has no pose, is returned as it is. The covariance grows by what the focal lengths leave open.
 
     Args:
         query: in the lengths of the result.
@@ -558,15 +558,18 @@ def with_own_focals(query: Query, result: QueryResult, max_error_deg: float) -> 
     alike = len(matches) / max(rig.num_cells(matches), 1)
     problem = _Problem(rig, matches, found.points, max_error_deg, np.full(4, OWN_FOCAL_STD / np.sqrt(alike)))
     which, start = np.arange(problem.unknowns), _Estimate(geometry.invert(result.world_from_rig), problem.unchanged)
-    fitted = problem.fit(start, (which < 6) | (which % 4 == 2))
-    if fitted is None:
+    free = (which < 6) | (which % 4 == 2)
+    fitted = problem.fit(start, free)
+    steps = [] if fitted is None else [problem.step(fitted, one, 1.0) for one in (free, which < 6)]
+    if fitted is None or None in steps:
         return result
-    shift, focals = _motion(start, fitted), rig.focals_px * (1 + fitted.parameters[::4])
+    unsure, sure = (alike * step.covariance[:6, :6] for step in steps if step is not None)
+    focals = rig.focals_px * (1 + fitted.parameters[::4])
     text = f"focal length of the image {', '.join(f'{focal:.1f}' for focal in focals)} px"
     return replace(
         result,
         world_from_rig=geometry.invert(fitted.rig_from_world),
-        covariance=None if result.covariance is None else result.covariance + np.outer(shift, shift),
+        covariance=None if result.covariance is None else result.covariance + unsure - sure,
         remark="; ".join(filter(None, [result.remark, text])),
     )
 
