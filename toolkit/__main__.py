@@ -179,7 +179,7 @@ def localize(
 
     from toolkit.capture import parse_camera
     from toolkit.errors import CameraError, CaptureError
-    from toolkit.exchange.georeference import GEO_COLUMNS, geographic_poses, origin_of
+    from toolkit.exchange.georeference import GEO_COLUMNS, deviation_of, geographic_poses, origin_of
     from toolkit.geometry import qt_from_pose
     from toolkit.scene import Run as FinishedRun
     from toolkit.scene import localize_images
@@ -204,6 +204,7 @@ def localize(
             if origin is not None:
                 geo = geographic_poses(poses[-1][None], origin)[0].tolist()
                 row |= {name: None if np.isnan(one) else one for name, one in zip(GEO_COLUMNS, geo, strict=True)}
+                row["geographic_std_m"] = float(np.hypot(result.position_std, deviation_of(scene_map.session)))
         rows.append(row)
         if not as_json:
             print(f"{path}: {row['status']}. {row['remark']}".strip())
@@ -212,8 +213,8 @@ def localize(
                 print(f"  position {xyz[0]:.3f} {xyz[1]:.3f} {xyz[2]:.3f}, qw qx qy qz "
                       f"{qw:.5f} {qx:.5f} {qy:.5f} {qz:.5f}, {row['inliers']} inliers")  # fmt: skip
                 if origin is not None:
-                    print(f"  latitude {geo[0]:.7f}, longitude {geo[1]:.7f}, altitude {geo[2]:.2f} m, "
-                          f"heading {geo[3]:.1f}, pitch {geo[4]:.1f} degrees")  # fmt: skip
+                    print(f"  latitude {geo[0]:.7f}, longitude {geo[1]:.7f}, altitude {geo[2]:.2f} m; good to "
+                          f"{row['geographic_std_m']:.2f} m; heading {geo[3]:.1f}, pitch {geo[4]:.1f} degrees")  # fmt: skip
     if picture is not None:
         from toolkit.figures.top_view import draw_scene
         from toolkit.results.localized import sure_points

@@ -795,10 +795,17 @@ class ReferenceSearch:
 
     def _nearest(self, vector: NDArray[np.float32], k: int, allowed: NDArray[np.bool_] | None) -> Ranked:
         """Return the k map images that are most similar to a vector, with the scores and in the order of `search`."""
-        dims = self._stored[0].dims
-        found = search(vector[None], self._descriptors, k, index=self._index, allowed=allowed, dims=dims)
-        scores, nearest = (of_vector[0, found[1][0] >= 0] for of_vector in found)
-        return self.rows[nearest], scores.astype(np.float64)
+        of_map, dims = self._descriptors, self._stored[0].dims
+        if self._index is not None or isinstance(of_map, Vectors) or len(dims) > 1:
+            found = search(vector[None], of_map, k, index=self._index, allowed=allowed, dims=dims)
+            scores, nearest = (of_vector[0, found[1][0] >= 0] for of_vector in found)
+            return self.rows[nearest], scores.astype(np.float64)
+        scores = np.einsum("nd,d->n", of_map, vector.astype(np.float64)).astype(np.float32)  # without FAISS and torch
+        if not np.isfinite(scores).all():
+            raise ValueError("The descriptors of the query or of the map have NaN or infinite values.")
+        candidates = np.arange(len(of_map)) if allowed is None else np.flatnonzero(allowed)
+        nearest = candidates[np.argsort(-scores[candidates], kind="stable")[:k]]
+        return self.rows[nearest], scores[nearest].astype(np.float64)
 
     def _rerank(self, ranked: Ranked, view: View) -> Ranked:
         """Return rows of map images and their numbers of verified matches, most first, as the rerank stage does."""
