@@ -213,8 +213,9 @@ def localize(
                 print(f"  position {xyz[0]:.3f} {xyz[1]:.3f} {xyz[2]:.3f}, qw qx qy qz "
                       f"{qw:.5f} {qx:.5f} {qy:.5f} {qz:.5f}, {row['inliers']} inliers")  # fmt: skip
                 if origin is not None:
-                    print(f"  latitude {geo[0]:.7f}, longitude {geo[1]:.7f}, altitude {geo[2]:.2f} m; good to "
-                          f"{row['geographic_std_m']:.2f} m; heading {geo[3]:.1f}, pitch {geo[4]:.1f} degrees")  # fmt: skip
+                    print(f"  latitude {geo[0]:.7f}, longitude {geo[1]:.7f}, altitude {geo[2]:.2f} m, "
+                          f"heading {geo[3]:.1f}, pitch {geo[4]:.1f} degrees")  # fmt: skip
+                    print(f"  good to {row['geographic_std_m']:.2f} m, with the GPS that placed the map")
     if picture is not None:
         from toolkit.figures.top_view import draw_scene
         from toolkit.results.localized import sure_points
