@@ -553,7 +553,14 @@ def reconstruct(
     from toolkit.capture import Capture
     from toolkit.capture.session import IMPORT_RECORD
     from toolkit.exchange.import_report import new_manifest
-    from toolkit.exchange.reconstruct import FOLDER, add_recording, inputs_of, reconstruct, remove_recording
+    from toolkit.exchange.reconstruct import (
+        FOLDER,
+        add_recording,
+        inputs_of,
+        model_points,
+        reconstruct,
+        remove_recording,
+    )  # fmt: skip
     from toolkit.figures.explore import draw_top_view
     from toolkit.files import read_json
 
@@ -562,7 +569,7 @@ def reconstruct(
     *photos, capture = sources
     manifest = _manifest_of(capture)
     tell = partial(print, file=sys.stderr) if as_json else print
-    points, option, report = dict[str, Any](), "", None
+    option, report = "", None
     session = capture / "sessions" / f"{device}_map"
     made = read_json(session / IMPORT_RECORD)
     first = {"hold_out": hold_out, "camera": camera, "table": table, "distance": distance, "positions": positions,
@@ -583,11 +590,11 @@ def reconstruct(
             record={"input": inputs},
         )  # fmt: skip
         report, option = result.report, result.camera
-        points = {"points": result.points, "colors": result.colors}
     if report is not None:
         print(report.as_json() if as_json else report.text())
     picture = capture / FOLDER / "cameras.png"
-    draw_top_view(Capture.open(capture), **points).savefig(picture)
+    points, colors = model_points(capture)
+    draw_top_view(Capture.open(capture), points=points, colors=colors).savefig(picture)
     tell(f"Picture: {picture}")
     if not manifest.exists():
         new_manifest(manifest.stem, capture)

@@ -15,7 +15,7 @@ from toolkit.capture import Capture
 from toolkit.capture.check import check_capture
 from toolkit.capture.session import RECONSTRUCTION_RECORD
 from toolkit.errors import CaptureError
-from toolkit.exchange.reconstruct import add_recording, reconstruct, remove_recording
+from toolkit.exchange.reconstruct import add_recording, model_points, reconstruct, remove_recording
 from toolkit.features.features import SiftExtractor
 from toolkit.features.stores import extract_session
 from toolkit.files import read_json
@@ -67,6 +67,7 @@ def test_new_photographs_are_registered_and_the_others_stay(
     assert all((session / name).read_text().startswith(before[name]) for name in TABLES)
     record = read_json(session / RECONSTRUCTION_RECORD)
     assert (record["photographs"], record["registered"]) == (7, 6)
+    assert [len(one) for one in model_points(first)] == [record["points"]] * 2
 
     opened, true = Capture.open(first)["ios_map"], Capture.open(small_capture)["ios_map"].world_from_cam()
     order = [int(opened.image_path(row).stem) for row in range(6)]

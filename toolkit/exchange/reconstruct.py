@@ -86,8 +86,6 @@ class Reconstruction:
     """The result of `reconstruct`."""
 
     report: ImportReport
-    points: Floats  # (P, 3) in the world
-    colors: NDArray[np.uint8]  # (P, 3) RGB
     camera: str = ""  # option for queries of the same camera, if the images have one
 
     @property
@@ -579,10 +577,15 @@ def reconstruct(
     for one in filter(None, (report, report.held_out)):
         write_text(one.session / RECONSTRUCTION_RECORD, json.dumps(record, indent=1) + "\n")
         _hand_over(work, one.session)
-    points = list(model.points3D.values())
-    xyz, rgb = np.array([point.xyz for point in points]), np.array([point.color for point in points], np.uint8)
     option = f" --camera '{camera_text(next(iter(model.cameras.values())))}'" if len(model.cameras) == 1 else ""
-    return Reconstruction(report, xyz.reshape(-1, 3), rgb.reshape(-1, 3), option)
+    return Reconstruction(report, option)
+
+
+def model_points(capture: str | Path) -> tuple[Floats, NDArray[np.uint8]]:
+    """Return the points (P, 3) of the model that a capture was reconstructed as, in the world, and their RGB (P, 3)."""
+    points = pycolmap.Reconstruction(str(Path(capture) / FOLDER / "models" / "0")).points3D.values()
+    xyz, rgb = np.array([point.xyz for point in points]), np.array([point.color for point in points], np.uint8)
+    return xyz.reshape(-1, 3), rgb.reshape(-1, 3)
 
 
 def _of_items(found: dict[str, T], items: Sequence[SourceImage], table: object) -> dict[str, T]:

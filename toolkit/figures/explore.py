@@ -129,7 +129,9 @@ def draw_top_view(
     layers.insert(0, Layer(points, None, tint, s=1.2, lw=0, rasterized=True))
     figure, _, panels = draw_places(ground, layers, everything, points)
     shared_legend(figure, [axis for axis, _, _ in panels], ncols=6, frameon=False, fontsize=8)
-    figure.suptitle("Cameras from above: maps (dots), queries where their pose is known (crosses)")
+    has_queries = any("marker" in layer.style for layer in layers)
+    crosses = ", queries where their pose is known (crosses)" if has_queries else ""
+    figure.suptitle(f"Cameras from above: maps (dots){crosses}")
     return figure
 
 
