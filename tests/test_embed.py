@@ -326,8 +326,40 @@ def test_only_images_that_were_added_are_embedded(
     assert sum(seen) == 11
 
 
-def test_the_vocabulary_stays_while_the_map_grows_to_twice_its_images(tiny: Path, tmp_path: Path) -> None:
-    shutil.rmtree(tiny / "sessions/hl_map")  # the vocabulary is of all maps
+@pytest.mark.parametrize("unreadable", [[], [3], [5], [3, 5], [0, 4]])
+def test_a_second_subsession_grows_with_images_that_cannot_be_read(
+    tiny: Path, tmp_path: Path, megaloc: dict[str, object], unreadable: list[int]
+) -> None:
+    """Images 3 to 5 are the second one's, image 5 is added."""
+    session, go = tiny / "sessions/ios_map", {"device": "ios", **megaloc}
+    lines = (session / "images.txt").read_text().splitlines(keepends=True)
+    (session / "proc/subsessions.txt").unlink()  # folders of images tell them
+    for at in range(3, 6):
+        path = session / "raw_data" / lines[1 + at].rsplit(",", 1)[1].strip()
+        moved = Path(str(path).replace("ios_a", "ios_b"))
+        moved.parent.mkdir(parents=True, exist_ok=True)
+        path.rename(moved)
+        head, name = lines[1 + at].rsplit(",", 1)
+        lines[1 + at] = f"{head},{name.replace('ios_a', 'ios_b')}"
+    for at in unreadable:
+        (session / "raw_data" / lines[1 + at].rsplit(",", 1)[1].strip()).write_bytes(b"")
+    (session / "images.txt").write_text("".join(lines[:6]))
+    call(embed_sessions, tiny / "sessions", tmp_path / "e", **go)  # type: ignore[arg-type]
+    (session / "images.txt").write_text("".join(lines))
+    call(embed_sessions, tiny / "sessions", tmp_path / "e", **go)  # type: ignore[arg-type]
+    call(embed_sessions, tiny / "sessions", tmp_path / "whole", **go)  # type: ignore[arg-type]
+    for path in (tmp_path / "whole/ios_map").rglob("*.csv"):
+        assert (tmp_path / "e/ios_map" / path.relative_to(tmp_path / "whole/ios_map")).read_bytes() == path.read_bytes()
+    for name in ("ios_a", "ios_b"):
+        grown, whole = (load_embeddings(tmp_path / run / "ios_map" / name)[0] for run in ("e", "whole"))
+        np.testing.assert_allclose(grown, whole, atol=1e-5)
+
+
+def test_the_vocabulary_stays_while_the_map_grows_to_twice_its_images(
+    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("toolkit.embedders.vlad.MAX_DIM", 2)  # else that of the vectors is the number of images
+    shutil.move(tiny / "sessions/hl_map", tmp_path / "hl_map")
     table = tiny / "sessions/ios_map/images.txt"
     lines = table.read_text().splitlines(keepends=True)
     vocabularies, first_vectors = [], []
@@ -340,6 +372,9 @@ def test_the_vocabulary_stays_while_the_map_grows_to_twice_its_images(tiny: Path
         first_vectors.append(vectors[:2].tobytes())
     assert [vocabulary == vocabularies[0] for vocabulary in vocabularies] == [True, True, True, False]
     assert [vectors == first_vectors[0] for vectors in first_vectors] == [True, True, True, False]
+    shutil.move(tmp_path / "hl_map", tiny / "sessions/hl_map")  # another map, which has words of its own
+    embed_sessions(tiny / "sessions", tmp_path / "e", device="ios")
+    assert (tmp_path / "e/vlad.npz").read_bytes() != vocabularies[-1]
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float16"])

@@ -186,7 +186,7 @@ class _Model:
                     left = batches.distribute(_embed_into, batches.left(todo), arguments, _label(part), "batch")
                     _embed_into(batches, left, *arguments)
                     batches.flush()
-                    failed |= {done + row: why for name, *_ in todo for row, why in batches.note(name)["failed"]}
+                    failed |= {done + at: why for name, *_ in todo for at, why in batches.note(name)["failed"]}
                     embedded = len(part.rows) - len(failed)
                     tables = _write_tables(folder, capture.name, part, failed)
                     starts = range(0, len(kept), settings.batch_size)
@@ -268,7 +268,7 @@ class _Model:
 
         It stays while the map grows, up to `GROWTH`, so that what was embedded with it stays, too.
         """
-        from toolkit.embedders.vlad import VLAD_FORMAT, Vlad
+        from toolkit.embedders.vlad import MAX_DIM, VLAD_FORMAT, Vlad
 
         capture, path = self.capture, self.out / "vlad.npz"
         rows_of = {session.id: session.camera_rows for session in capture.usable("map")}
@@ -289,7 +289,10 @@ class _Model:
             return path
         old = ((self.skip_existing and read_sidecar(path)) or {}).get("maps", {})
         counts = {name: one["count"] for name, one in old.items()}
-        enough = GROWTH * sum(counts.values()) >= len(images) and counts.keys() <= maps.keys()
+        grown = counts.keys() == maps.keys() and all(
+            GROWTH * counts[name] >= len(rows) for name, rows in rows_of.items()
+        )
+        enough = grown and sum(counts.values()) >= MAX_DIM  # else the dimension is the number of images
         if enough and self._is_current(path, record_of(counts)):
             return path
         chosen: dict[str, list[int]] = {}
@@ -342,22 +345,22 @@ def _embed_into(
     left = np.concatenate([np.zeros(0, np.int64), *rows])
 
     def read(at: int) -> tuple[int, Any | str]:
-        """Return the row and the input (features or a prepared image) of an image; a str is why it has none."""
+        """Return the number and the input (features or a prepared image) of an image; a str is why it has none."""
         row = int(part.rows[at])
         if store is not None:
             name = session.image_name(row)
             if name not in store:
-                return row, store.failed.get(name, "no local features were extracted")
-            return row, embedder.prepare(store[name])
+                return at, store.failed.get(name, "no local features were extracted")
+            return at, embedder.prepare(store[name])
         try:
             image = read_image(session.image_path(row), min_side=embedder.min_side)
         except ImageError as error:
-            return row, str(error)
-        return row, embedder.prepare(turn_image(image, int(part.turns[at])))
+            return at, str(error)
+        return at, embedder.prepare(turn_image(image, int(part.turns[at])))
 
     def stack(items: list[tuple[int, Any | str]]) -> tuple[Any, dict[int, str]]:
         readable = [item for _, item in items if not isinstance(item, str)]
-        unreadable = {row: item for row, item in items if isinstance(item, str)}
+        unreadable = {at: item for at, item in items if isinstance(item, str)}
         return embedder.stack(readable) if readable else readable, unreadable
 
     inputs = iter(prefetch(read, left.tolist(), workers=default_workers(), ahead=2 * size))
@@ -410,7 +413,7 @@ def _write_tables(folder: Path, capture: str, part: _Subsession, failed: dict[in
             "sensor_id": images["sensor_id"].to_numpy(),
             "timestamp": images["timestamp"].to_numpy(),
             "abs_path": [_abs_path(capture, session, row) for row in part.rows],
-            "reason": [failed.get(int(row), "") for row in part.rows],
+            "reason": [failed.get(at, "") for at in range(len(part.rows))],
         }
     )
     unreadable = folder / "failed.csv"

@@ -467,6 +467,11 @@ def test_principal_points_move_to_where_they_fit_but_not_far_from_the_middle_of_
         for camera in model.cameras.values():
             moved = np.array([camera.principal_point_x - 512, camera.principal_point_y - 384])
             assert low < moved @ way / (way @ way) < high
+    _, model = synthetic_model((518.0, 380.0), 0.3)
+    for number in list(model.points3D)[20:]:
+        model.delete_point3D(number)
+    work._refine(model)  # each image keeps too few points
+    assert model.num_reg_images() == 0
     work, model = synthetic_model((518.0, 380.0), 0.3)
     work.known = {0, 1}  # given intrinsics stay
     work._refine(model)

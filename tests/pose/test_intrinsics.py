@@ -215,7 +215,7 @@ def test_where_matches_do_not_tell_the_focal_length_it_stays() -> None:
     assert own.position_std == pytest.approx(8.0 * OWN_FOCAL_STD, rel=0.1)  # the plane is 8 m away
 
 
-def test_without_a_pose_or_with_wrong_intrinsics_there_is_no_own_focal_length() -> None:
+def test_a_result_that_is_not_ok_stays() -> None:
     query, result = localized((4.0, 15.0), (0.993,))
     for one in (QueryResult.failed("dark"), replace(result, status=Status.LOW_CONFIDENCE, reason=CAMERA)):
         assert with_own_focals(query, one, MAX_ERROR_DEG) is one

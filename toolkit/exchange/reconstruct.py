@@ -399,13 +399,17 @@ class _Work:
             camera = model.cameras[image.camera_id]
             in_cells = (CELLS * xy / (camera.width, camera.height)).astype(int)
             observations, cells = observations + len(xy), cells + len(np.unique(in_cells, axis=0))
+        if not observations:
+            return
         cameras = list(model.cameras.values())
         before, focals_px = _centers(cameras), np.array([[camera.mean_focal_length()] for camera in cameras])
         options = self._adjustment()
         options.refine_principal_point = True
         options.ceres.solver_options.max_num_iterations = 15
         solver: Any = pycolmap.create_default_bundle_adjuster(options, self._of_model(model), model)
-        costs = solver.solve().ceres_summary
+        costs = getattr(solver.solve(), "ceres_summary", None)
+        if costs is None:  # no point has enough observations
+            return
         freedom = 2 * observations - 3 * model.num_points3D() - 6 * model.num_reg_images()
         variance = max(2 * costs.final_cost / max(freedom, 1) * observations / max(cells, 1), 1e-12)
         gain, std = 2 * (costs.initial_cost - costs.final_cost) / variance, CENTER_STD * focals_px

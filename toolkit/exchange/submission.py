@@ -90,14 +90,15 @@ def collect(
     """
     require_known("failed", failed, FAILED)
     folders, stage = [Path(run) for run in runs], "sequence" if sequence else "localize"
-    for folder in folders:
-        if not any(folder.glob("*/poses")):
-            raise ManifestError.at(folder, "no poses", "a finished run, <output_root>/<manifest name>")
+    if absent := [folder for folder in folders if not folder.is_dir()]:
+        raise ManifestError.at(absent[0], "no such run folder", "<output_root>/<manifest name>")
     if os.path.isfile(description):  # noqa: PTH113 - Path.is_file raises an error for a long text
         description = Path(description).read_text(encoding="utf-8", errors="replace")
     elif description.endswith(".txt") and len(description.split()) == 1:
         raise ManifestError(f"{description}: no such file. Give an existing file, or the description itself.")
     present = {path.parent.name for folder in folders for path in folder.glob("*/poses")}
+    if not present:
+        raise ManifestError.at(", ".join(map(str, folders)), "no poses", "finished runs, <output_root>/<manifest name>")
     expected = SCENES if present & SCENES.keys() else {}
     poses, tables, rows = dict[str, Trajectory](), [pd.DataFrame(columns=COLUMNS_OF_QUERIES)], list[dict[str, object]]()
     with open_captures(folders, captures, sorted(present.union(scenes, expected))) as capture_of:

@@ -8,6 +8,7 @@ have one folder of matches per kind and settings, with an item per pair of image
 import logging
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import islice
@@ -20,7 +21,7 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Session
 from toolkit.capture.images import camera_text, default_workers, prefetch, read_image, sees_all
-from toolkit.errors import ArtifactError, ImageError
+from toolkit.errors import ArtifactError, DamagedError, ImageError
 from toolkit.features.features import (
     KINDS,
     Extractor,
@@ -172,9 +173,10 @@ def extract_session(
     with Items(path, extractor.settings, skip_existing=skip_existing) as items:
         todo = items.left((name, source, row_of[name], int(turns[row_of[name]])) for name, source in made_from.items())
         if todo and skip_existing and given.is_dir():  # it has grown
-            with Items(given, extractor.settings) as reconstructed:
-                for name, source, *_ in todo:
-                    if reconstructed.is_current(name, source):
+            reconstructed = Items(given, extractor.settings)
+            for name, source, *_ in todo:
+                if reconstructed.is_current(name, source):
+                    with suppress(DamagedError):  # it is extracted
                         items.add(name, source, reconstructed[name], reconstructed.note(name))
             items.flush()
             todo = items.left(todo)

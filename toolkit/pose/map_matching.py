@@ -37,7 +37,7 @@ from toolkit.features.features import KINDS, FeatureKind, LocalFeatures, MutualM
 from toolkit.features.matching import Matcher
 from toolkit.geometry import Floats, Ints
 from toolkit.mapping.local_map import LocalMap
-from toolkit.pose.base import AGREEMENT, CAMERA, Matches, NetworkMatches, Query, QueryResult, References, RigQuery
+from toolkit.pose.base import AGREEMENT, Matches, NetworkMatches, Query, QueryResult, References, RigQuery, Status
 from toolkit.threads import fixed_sums
 
 MAX_MAP_FEATURES = 1000
@@ -542,8 +542,8 @@ def with_own_focals(query: Query, result: QueryResult, max_error_deg: float) -> 
     """Return a result with the pose, and in its remark the focal lengths, that fit its correspondences best.
 
     Each focal length has a normal prior around the stated one, see `OWN_FOCAL_STD`. Errors in a cell of an image are
-    alike, so correspondences count as many as there are cells with one. A result that says that the intrinsics are
-    wrong, or has no pose, is returned as it is. The covariance grows by what the focal lengths leave open.
+    alike, so correspondences count as many as there are cells with one. A result that is not `ok` is returned as it
+    is. The covariance grows by what the focal lengths leave open.
 
     Args:
         query: in the lengths of the result.
@@ -551,15 +551,15 @@ def with_own_focals(query: Query, result: QueryResult, max_error_deg: float) -> 
         max_error_deg: largest error of an inlier.
     """
     found, cameras = result.correspondences, [view.camera for view in query.views]
-    if result.world_from_rig is None or result.reason == CAMERA or not found.agrees.any():
+    if result.status is not Status.OK or result.world_from_rig is None or not found.agrees.any():
         return result
     rig, chosen = RigQuery(cameras, query.rig_from_cams, [[] for _ in cameras]), np.flatnonzero(found.agrees)
     matches = Matches(found.camera[chosen], found.pixels[chosen], chosen)
     alike = len(matches) / max(rig.num_cells(matches), 1)
     problem = _Problem(rig, matches, found.points, max_error_deg, np.full(4, OWN_FOCAL_STD / np.sqrt(alike)))
-    which, start = np.arange(problem.unknowns), _Estimate(geometry.invert(result.world_from_rig), problem.unchanged)
+    which = np.arange(problem.unknowns)
     free = (which < 6) | (which % 4 == 2)
-    fitted = problem.fit(start, free)
+    fitted = problem.fit(_Estimate(geometry.invert(result.world_from_rig), problem.unchanged), free)
     steps = [] if fitted is None else [problem.step(fitted, one, 1.0) for one in (free, which < 6)]
     if fitted is None or None in steps:
         return result

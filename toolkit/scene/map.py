@@ -642,9 +642,11 @@ class Map:
     @cached_property
     def estimated_cameras(self) -> set[str]:
         """Intrinsics, as `camera_text` writes them, that a reconstruction estimated, for all images of a camera."""
-        record = read_json(self.session.path / RECONSTRUCTION_RECORD)
-        sensors = self.session.images["sensor_id"].iloc[self.session.camera_rows].unique() if record else []
-        return {camera_text(self.session.camera(str(one))) for one in sensors} - {*record.get("given intrinsics", [])}
+        given = read_json(self.session.path / RECONSTRUCTION_RECORD).get("given intrinsics")
+        if given is None:
+            return set()
+        sensors = self.session.images["sensor_id"].iloc[self.session.camera_rows].unique()
+        return {camera_text(self.session.camera(str(one))) for one in sensors} - {*given}
 
     @property
     def length(self) -> float:
