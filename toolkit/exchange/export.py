@@ -467,7 +467,7 @@ def geo_table(run: str | Path, capture: str | Path | None = None) -> pd.DataFram
         for scene in scenes:
             for (map_device, query_device), path in pairs_of(SceneFiles(run, scene).poses_dir).items():
                 results = PairResults.open(path)
-                require_current(path, "localize", missing=False)
+                require_current(results.path, "localize", missing=False)
                 mapped = capture_of(scene)[f"{map_device}_map"]
                 try:
                     origin = origin_of(mapped)
