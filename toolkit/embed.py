@@ -31,6 +31,7 @@ from toolkit.files import (
     read_sidecar,
     sidecar_path,
     write_atomic,
+    write_csv,
     write_sidecar,
     write_text,
 )
@@ -420,9 +421,9 @@ def _write_tables(folder: Path, capture: str, part: _Subsession, failed: dict[in
     if failed:
         log.warning("%s/%s: %d of %d images cannot be read, see %s",
                     session.id, part.name, len(failed), len(table), unreadable)  # fmt: skip
-        write_text(unreadable, table[table["reason"] != ""].to_csv(index=False, lineterminator="\n"))
+        write_csv(unreadable, table[table["reason"] != ""])
     else:
         unreadable.unlink(missing_ok=True)
     embedded = table[table["reason"] == ""].drop(columns="reason").reset_index(drop=True)
-    write_text(folder / "manifest.csv", embedded.to_csv(index_label="row_index"))
+    write_csv(folder / "manifest.csv", embedded, index=True, index_label="row_index")
     return [folder / "manifest.csv", *([unreadable] if failed else [])]

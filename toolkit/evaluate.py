@@ -25,8 +25,8 @@ from toolkit.files import (
     read_references,
     require_whole,
     why_older,
+    write_csv,
     write_sidecar,
-    write_text,
 )
 from toolkit.geometry import Floats
 from toolkit.manifest import EvaluateSettings
@@ -271,7 +271,7 @@ def write_evaluation(
             continue
         written.append(path)
         if isinstance(content, pd.DataFrame):
-            write_text(path, content.to_csv(index=False, lineterminator="\n"))
+            write_csv(path, content)
         else:
             save_figure(content, path)
     write_sidecar(out / "recall.csv", settings, written[1:], made_from=sources, captured=truths)

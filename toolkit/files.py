@@ -30,6 +30,7 @@ from toolkit import __version__
 from toolkit.errors import COMMAND, ArtifactError, ToolkitError
 
 if TYPE_CHECKING:
+    import pandas as pd
     from filelock import BaseFileLock
 
 log = logging.getLogger(__name__)
@@ -198,6 +199,12 @@ def write_text(path: str | Path, text: str) -> None:
     """Write a text file atomically; see `write_atomic`."""
     with write_atomic(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def write_csv(path: str | Path, table: "pd.DataFrame", **options: Any) -> None:
+    """Write a table atomically, by default without its index; see `write_atomic` and pandas' `to_csv` for `options`."""
+    with write_atomic(path) as temporary:
+        table.to_csv(temporary, lineterminator="\n", **({"index": False} | options))
 
 
 def fingerprint(value: Any) -> str:

@@ -33,6 +33,7 @@ from toolkit.files import (
     read_sidecar,
     require_same,
     sidecar_path,
+    write_csv,
     write_sidecar,
     write_text,
 )
@@ -540,8 +541,7 @@ def _write_poses(path: Path, rows: Sequence[dict[str, Any]], settings: LocalizeS
     columns = [*COLUMNS, *(PREDICTION_COLUMNS if settings.predicts else [])]
     columns += FALLBACK_COLUMNS if settings.features.escalation else []
     table = pd.DataFrame(rows).rename(columns=POSES_UNIT).reindex(columns=columns)
-    table = in_unit_of_poses(table, settings.unit)
-    write_text(path.with_suffix(".csv"), table.to_csv(index=False, lineterminator="\n"))
+    write_csv(path.with_suffix(".csv"), in_unit_of_poses(table, settings.unit))
     posed = [row for row in rows if np.isfinite(row["world_from_rig"]).all()]
     covariances = np.array([row["covariance"] for row in posed]).reshape(-1, 6, 6)
     Trajectory.from_poses(

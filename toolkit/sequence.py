@@ -28,8 +28,8 @@ from toolkit.files import (
     read_map_record,
     read_sidecar,
     require_whole,
+    write_csv,
     write_sidecar,
-    write_text,
 )
 from toolkit.geometry import Floats, Ints, pose_error
 from toolkit.manifest import SequenceSettings
@@ -156,7 +156,7 @@ def _place_pair(
         unit = read_map_record(map_record_path(poses_dir, capture.name, map_device))["unit"]
         csvs = {out.with_suffix(".csv"): in_unit_of_poses(frames, unit), out.with_name(f"{out.stem}_steps.csv"): steps}
         for path, rows in csvs.items():
-            write_text(path, rows.to_csv(index=False, lineterminator="\n"))
+            write_csv(path, rows)
         trajectory.write(out)
         write_sidecar(out, record, list(csvs), made_from=inputs, unfinished=bool(relocalizer and relocalizer.met_a_bug))
     frames = pd.read_csv(out.with_suffix(".csv"), keep_default_na=False)

@@ -65,7 +65,7 @@ from toolkit.files import (
     own_name,
     read_json,
     recover_folder,
-    write_atomic,
+    write_csv,
     write_folder,
     write_text,
 )
@@ -498,8 +498,7 @@ class Draft(Options):
                 old = read_json(session / IMPORT_RECORD)
                 world = {key: (old or record).get(key) for key in ("up", "z is up")}
                 record = old | record | {"before": self.before} | world
-            with write_atomic(list_file) as temporary:
-                listed.to_csv(temporary, index=False)
+            write_csv(list_file, listed)
             if self.placing == "link" or (self.before and is_linked_here(self.session)):
                 note_linked_here(session)
             record["seconds"] = round(time.perf_counter() - self.started, 3)

@@ -47,7 +47,7 @@ from toolkit.files import (
     read_references,
     read_sidecar,
     require_current,
-    write_atomic,
+    write_csv,
     write_folder,
     write_text,
 )
@@ -207,8 +207,7 @@ def export_table(session: Session, out: str | Path, ground_truth: bool = False) 
     table["model"] = [camera.model.name for camera in cameras]
     table["width"], table["height"] = [c.width for c in cameras], [c.height for c in cameras]
     table["params"] = [" ".join(repr(float(value)) for value in camera.params) for camera in cameras]
-    with write_atomic(out) as temporary:
-        table.to_csv(temporary, index=False)
+    write_csv(out, table)
     return Path(out)
 
 
@@ -508,8 +507,7 @@ def export_geo(run: str | Path, out: str | Path, capture: str | Path | None = No
         raise ManifestError(f"{out}: found the ending {out.suffix!r}, expected {' or '.join(FORMATS)}.")
     table = geo_table(run, capture).drop(columns="path").assign(image=lambda rows: rows["image"].map(own_name))
     if out.suffix.lower() == ".csv":
-        with write_atomic(out) as temporary:
-            table.to_csv(temporary, index=False)
+        write_csv(out, table)
         return int(table["latitude_deg"].notna().sum())
     features = []
     for row in json.loads(table.to_json(orient="records", double_precision=15)):  # NaN becomes null

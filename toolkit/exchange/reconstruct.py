@@ -49,7 +49,7 @@ from toolkit.files import (
     link_folder,
     own_name,
     read_json,
-    write_atomic,
+    write_csv,
     write_folder,
     write_text,
 )
@@ -785,8 +785,7 @@ def remove_recording(name: str, capture: str | Path, device: str = "ios") -> str
         for old in (f"{RAW_DATA}/{IMPORTED}{name}", f"{MASKS}/{IMPORTED}{name}", f"{MASKS}/{IMPORTED}{name}.png"):
             (shutil.rmtree if (changed / old).is_dir() else Path.unlink)(changed / old, True)
         table = pd.read_csv(changed / "proc" / "import.csv", dtype=str, keep_default_na=False)
-        with write_atomic(changed / "proc" / "import.csv") as temporary:
-            table[~(table["image"] + "/").str.startswith(f"{name}/")].to_csv(temporary, index=False)
+        write_csv(changed / "proc" / "import.csv", table[~(table["image"] + "/").str.startswith(f"{name}/")])
         if is_linked_here(session):
             note_linked_here(changed)
     for image in [image for image in model.images.values() if image.name in gone and image.has_pose]:

@@ -22,7 +22,16 @@ from toolkit.capture.check import UNIT_TOLERANCE
 from toolkit.capture.names import SPLITS, allow_outside, extra_devices
 from toolkit.capture.tables import read_table
 from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
-from toolkit.files import RAW_DATA, SceneFiles, pair_name, read_json, read_references, require_current, write_atomic
+from toolkit.files import (
+    RAW_DATA,
+    SceneFiles,
+    pair_name,
+    read_json,
+    read_references,
+    require_current,
+    write_atomic,
+    write_csv,
+)
 from toolkit.geometry import invert, unit
 from toolkit.manifest import require_known
 from toolkit.pose.base import Status, statuses
@@ -72,8 +81,7 @@ class Submission:
                     info = zipfile.ZipInfo(name)  # its time is fixed, so the same poses give the same bytes
                     info.external_attr = 0o644 << 16
                     archive.writestr(info, (Path(folder) / name).read_bytes(), zipfile.ZIP_DEFLATED)
-        with write_atomic(self.path.with_suffix(".csv")) as temporary:
-            self.queries.to_csv(temporary, index=False)
+        write_csv(self.path.with_suffix(".csv"), self.queries)
         return self.path
 
 

@@ -12,7 +12,7 @@ from toolkit.capture.names import in_order
 from toolkit.errors import ArtifactError
 from toolkit.figures.evaluation import wilson_interval
 from toolkit.figures.style import percent
-from toolkit.files import SceneFiles, map_record_path, read_map_record, write_text
+from toolkit.files import SceneFiles, map_record_path, read_map_record, write_csv, write_text
 from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings
 from toolkit.pose.base import status_counts
 from toolkit.results.pair import AnySettings, load_maps, map_files, pairs_of, read_settings
@@ -98,7 +98,7 @@ def write_tables(stem: Path, table: pd.DataFrame, shown: pd.DataFrame, caption: 
     for letter, command in LATEX.items():
         text = text.replace(letter, command)
     text = text.replace(r"\begin{tabular}", f"{FIT}%\n\\begin{{tabular}}").replace(r"\end{tabular}", "\\end{tabular}}")
-    write_text(paths[0], table.to_csv(index=False, float_format="%.6g"))
+    write_csv(paths[0], table, float_format="%.6g")
     write_text(paths[1], f"% \\usepackage{{booktabs,graphicx}}\n{text}")
     return paths
 
