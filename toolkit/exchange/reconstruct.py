@@ -55,7 +55,7 @@ from toolkit.files import (
 )
 from toolkit.geometry import Floats, Ints, unit
 from toolkit.manifest import LocalizeSettings, SiftSettings
-from toolkit.pose.base import CELLS
+from toolkit.pose.base import cells_of
 from toolkit.scene.query import FOCAL_PRIOR
 from toolkit.store.items import Items, retry_damaged
 from toolkit.threads import one_thread
@@ -393,14 +393,13 @@ class _Work:
         around the image centers (`CENTER_STD`). Errors in one cell of an image are alike, for what the camera model
         lacks, so those of a cell count as one: without this, principal points go where they imitate such errors.
         """
-        observations = cells = 0
-        for image in map(model.image, model.reg_image_ids()):
-            xy = np.array([point.xy for point in image.points2D if point.has_point3D()]).reshape(-1, 2)
-            camera = model.cameras[image.camera_id]
-            in_cells = (CELLS * xy / (camera.width, camera.height)).astype(int)
-            observations, cells = observations + len(xy), cells + len(np.unique(in_cells, axis=0))
-        if not observations:
+        images = [model.image(number) for number in model.reg_image_ids()]
+        seen = [[point.xy for point in image.points2D if point.has_point3D()] for image in images]
+        index = np.repeat(np.arange(len(images)), [len(pixels) for pixels in seen])
+        if not (observations := len(index)):
             return
+        pixels = np.array([xy for of_image in seen for xy in of_image])
+        cells = len(np.unique(cells_of(index, pixels, [model.cameras[image.camera_id] for image in images])))
         cameras = list(model.cameras.values())
         before, focals_px = _centers(cameras), np.array([[camera.mean_focal_length()] for camera in cameras])
         options = self._adjustment()
@@ -411,7 +410,7 @@ class _Work:
         if costs is None:  # no point has enough observations
             return
         freedom = 2 * observations - 3 * model.num_points3D() - 6 * model.num_reg_images()
-        variance = max(2 * costs.final_cost / max(freedom, 1) * observations / max(cells, 1), 1e-12)
+        variance = max(2 * costs.final_cost / max(freedom, 1) * observations / cells, 1e-12)
         gain, std = 2 * (costs.initial_cost - costs.final_cost) / variance, CENTER_STD * focals_px
         way = (_centers(cameras) - before) / std
         from_middle = (before - np.array([(camera.width / 2, camera.height / 2) for camera in cameras])) / std

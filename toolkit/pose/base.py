@@ -666,6 +666,15 @@ class Matches:
         return Matches(self.camera[part], self.pixels[part], self.point[part])
 
 
+def cells_of(camera: Ints, pixels: Floats, cameras: Sequence[pycolmap.Camera], along: int = CELLS) -> Ints:
+    """Return the cells (K,) of pixels (K, 2) in the images of cameras, given by index (K,), as numbers; an image has
+    `along` columns and rows of them.
+    """
+    sizes = np.array([(one.width, one.height) for one in cameras])
+    column, row = np.clip(along * pixels / sizes[camera], 0, along - 1).astype(np.int64).T
+    return np.asarray((camera * along + row) * along + column, np.int64)
+
+
 class RigQuery:
     """The cameras of a query and their features; computes poses, projections and errors of matches.
 
@@ -695,10 +704,8 @@ class RigQuery:
         return len(np.unique(self.cells(matches)))
 
     def cells(self, matches: Matches, along: int = CELLS) -> Ints:
-        """Return the cells (K,) of matches, as numbers; an image has `along` columns and rows of them."""
-        sizes = np.array([(camera.width, camera.height) for camera in self.cameras])
-        column, row = np.clip(along * matches.pixels / sizes[matches.camera], 0, along - 1).astype(np.int64).T
-        return np.asarray((matches.camera * along + row) * along + column, np.int64)
+        """Return the cells (K,) of matches, see `cells_of`."""
+        return cells_of(matches.camera, matches.pixels, self.cameras, along)
 
     def pixels(self, camera: Ints, keypoint: Ints, kind: int) -> Floats:
         """Return the pixels (K, 2) of keypoints of one kind, given by camera (K,) and index (K,)."""
