@@ -189,7 +189,7 @@ def localize(
     except ValueError as error:
         raise CameraError(f"camera: {error}") from None
     scene_map = FinishedRun.open(run).map(device, scene)
-    origin = None
+    origin, place_std_m = None, deviation_of(scene_map.session)
     with suppress(CaptureError):
         origin = origin_of(scene_map.session)
     rows, poses = list[dict[str, Any]](), list[Any]()
@@ -204,7 +204,7 @@ def localize(
             if origin is not None:
                 geo = geographic_poses(poses[-1][None], origin)[0].tolist()
                 row |= {name: None if np.isnan(one) else one for name, one in zip(GEO_COLUMNS, geo, strict=True)}
-                row["geographic_std_m"] = float(np.hypot(result.position_std, deviation_of(scene_map.session)))
+                row["geographic_std_m"] = float(np.hypot(result.position_std, place_std_m))
         rows.append(row)
         if not as_json:
             print(f"{path}: {row['status']}. {row['remark']}".strip())
@@ -560,7 +560,7 @@ def reconstruct(
         model_points,
         reconstruct,
         remove_recording,
-    )  # fmt: skip
+    )
     from toolkit.figures.explore import draw_top_view
     from toolkit.files import read_json
 

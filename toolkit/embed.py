@@ -272,9 +272,11 @@ class _Model:
         from toolkit.embedders.vlad import MAX_DIM, VLAD_FORMAT, Vlad
 
         capture, path = self.capture, self.out / "vlad.npz"
-        rows_of = {session.id: session.camera_rows for session in capture.usable("map")}
-        maps = {name: _Subsession(capture[name], name, rows, 0 * rows) for name, rows in rows_of.items()}
-        images = [(capture[name], int(row)) for name, rows in rows_of.items() for row in rows]
+        maps = {
+            session.id: _Subsession(session, session.id, session.camera_rows, 0 * session.camera_rows)
+            for session in capture.usable("map")
+        }
+        images = [(part.session, int(row)) for part in maps.values() for row in part.rows]
         if not images:
             fault = "has no <device>_map session that can be read; `vlad` learns its vocabulary from the map"
             raise ToolkitError(f"{capture.path}/sessions {fault}.")
@@ -285,13 +287,13 @@ class _Model:
             settings = {"features": SiftExtractor().settings, "seed": self.settings.seed, "format": VLAD_FORMAT}
             return settings | {"maps": of_maps}
 
-        record = record_of({name: len(rows) for name, rows in rows_of.items()})
+        record = record_of({name: len(part.rows) for name, part in maps.items()})
         if self._is_current(path, record):
             return path
         old = ((self.skip_existing and read_sidecar(path)) or {}).get("maps", {})
         counts = {name: one["count"] for name, one in old.items()}
         grown = counts.keys() == maps.keys() and all(
-            GROWTH * counts[name] >= len(rows) for name, rows in rows_of.items()
+            GROWTH * counts[name] >= len(part.rows) for name, part in maps.items()
         )
         enough = grown and sum(counts.values()) >= MAX_DIM  # else the dimension is the number of images
         if enough and self._is_current(path, record_of(counts)):

@@ -560,16 +560,18 @@ def with_own_focals(query: Query, result: QueryResult, max_error_deg: float) -> 
     which = np.arange(problem.unknowns)
     free = (which < 6) | (which % 4 == 2)
     fitted = problem.fit(_Estimate(geometry.invert(result.world_from_rig), problem.unchanged), free)
-    steps = [] if fitted is None else [problem.step(fitted, one, 1.0) for one in (free, which < 6)]
-    if fitted is None or None in steps:
+    if fitted is None:
         return result
-    unsure, sure = (alike * step.covariance[:6, :6] for step in steps if step is not None)
+    unsure, sure = (problem.step(fitted, one, 1.0) for one in (free, which < 6))
+    if unsure is None or sure is None:
+        return result
+    opened = alike * (unsure.covariance - sure.covariance)[:6, :6]
     focals = rig.focals_px * (1 + fitted.parameters[::4])
     text = f"focal length of the image {', '.join(f'{focal:.1f}' for focal in focals)} px"
     return replace(
         result,
         world_from_rig=geometry.invert(fitted.rig_from_world),
-        covariance=None if result.covariance is None else result.covariance + unsure - sure,
+        covariance=None if result.covariance is None else result.covariance + opened,
         remark="; ".join(filter(None, [result.remark, text])),
     )
 
