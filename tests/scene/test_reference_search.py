@@ -52,11 +52,7 @@ def test_an_open_map_searches_as_the_retrieve_stage(searched: SceneFiles, small_
 def test_an_open_map_finds_what_the_stages_found(
     searched: SceneFiles, small_capture: Path, device: str, reranked: bool
 ) -> None:
-    """From the pixels of an image: its features and descriptors are computed again.
-
-    BLAS rounds the product of one image's VLAD otherwise than that of a batch, so scores differ in their last digit;
-    numbers of verified matches do not.
-    """
+    """From the pixels of an image: its features and descriptors are computed again, and the scores are equal."""
     capture = Capture.open(small_capture)
     session, search = capture[f"{device}_query"], ReferenceSearch(searched, capture["ios_map"], reranked)
     folder = searched.reranked_dir if reranked else searched.retrieval_dir
@@ -67,12 +63,10 @@ def test_an_open_map_finds_what_the_stages_found(
         query = Query([view], np.eye(4)[None])
         with fixed_sums:  # as in the verbs of `Map`
             ((rows, scores),) = search.find(replace(query, descriptors=search.describe(query, ())))
-        assert_references(search, line, rows, scores, 0.0 if reranked else 1e-6)
+        assert_references(search, line, rows, scores)
 
 
-def assert_references(
-    search: ReferenceSearch, line: dict[str, Any], rows: Ints, scores: Floats, tolerance: float = 0.0
-) -> None:
+def assert_references(search: ReferenceSearch, line: dict[str, Any], rows: Ints, scores: Floats) -> None:
     """The order, the images and the scores of a query image are those in its line of a stage's file."""
     assert [search.session.image_name(int(row)) for row in rows] == [image_name(one["path"]) for one in line["topk"]]
-    np.testing.assert_allclose(scores, [one["score"] for one in line["topk"]], rtol=0.0, atol=tolerance)
+    np.testing.assert_array_equal(scores, [one["score"] for one in line["topk"]])

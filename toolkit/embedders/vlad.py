@@ -106,8 +106,9 @@ class Vlad:
 
         The rows do not have length 1: compare them by dot products, or normalize them for cosines.
         """
-        batch = inputs if isinstance(inputs, np.ndarray) else self.stack(inputs)
-        return batch @ self.projection
+        # One by one: BLAS rounds the products of a batch and of one image differently.
+        rows = [self.prepare(item) @ self.projection for item in inputs]
+        return np.array(rows, np.float32).reshape(-1, self.dim)
 
     @classmethod
     @fixed_sums
