@@ -36,7 +36,6 @@ from toolkit.capture.images import HEADER_ERRORS, camera_text
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.errors import COMMAND, ArtifactError, CaptureError, DamagedError, ImageError, ManifestError, first_line
 from toolkit.exchange.georeference import GEO_COLUMNS, deviation_of, geographic_poses, origin_of
-from toolkit.exchange.submission import open_captures
 from toolkit.features.features import DESCRIPTOR_SCALE, LocalFeatures, PairMatches
 from toolkit.features.stores import FeatureStore, MatchStore, features_path, match_name, write_features, write_matches
 from toolkit.files import (
@@ -56,6 +55,7 @@ from toolkit.manifest import require_known
 from toolkit.mapping.local_map import LocalMap, map_path
 from toolkit.pose.base import Status, statuses
 from toolkit.results.pair import PairResults, localized_scenes, map_inputs, names_of_maps, pairs_of
+from toolkit.runs.folder import open_captures
 from toolkit.store.hdf5 import HDF5_ERRORS, group_names_of, has_group, read_group, write_groups
 from toolkit.store.items import Items
 

@@ -7,35 +7,24 @@ trajectories format without covariances. Equal runs and options give equal bytes
 import os
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from toolkit.capture import COLUMNS, Capture, Trajectory
 from toolkit.capture.check import UNIT_TOLERANCE
-from toolkit.capture.names import SPLITS, allow_outside, extra_devices
-from toolkit.capture.tables import read_table
-from toolkit.errors import ArtifactError, CaptureError, ManifestError, ToolkitError
-from toolkit.files import (
-    RAW_DATA,
-    SceneFiles,
-    pair_name,
-    read_json,
-    read_references,
-    require_current,
-    write_atomic,
-    write_csv,
-)
+from toolkit.capture.names import SPLITS
+from toolkit.capture.tables import COLUMNS, Trajectory, read_table
+from toolkit.errors import ArtifactError, ManifestError, ToolkitError
+from toolkit.files import RAW_DATA, SceneFiles, pair_name, read_references, require_current, write_atomic, write_csv
 from toolkit.geometry import invert, unit
 from toolkit.manifest import require_known
 from toolkit.pose.base import Status, statuses
 from toolkit.results.pair import PairResults
+from toolkit.runs.folder import open_captures
 
 FAILED = ("nearest", "leave-out")
 SCENES = {"HYDRO": "HYDRO", "SUCCULENT": "SUCCU"}  # captures of the CroCoDL challenge, with their names in its files
@@ -72,15 +61,16 @@ class Submission:
         """Write the zip file, and `queries` beside it. Raise ToolkitError if no pair has poses."""
         if not self.poses:
             raise ToolkitError(f"Nothing to submit: none of the {len(self.table)} pairs has poses.\n{self.text()}")
-        with tempfile.TemporaryDirectory() as folder, write_atomic(self.path) as temporary:
-            (Path(folder) / "description.txt").write_text(self.description, encoding="utf-8", newline="\n")
+        contents = {"description.txt": self.description.encode()}
+        with tempfile.TemporaryDirectory() as folder:
             for name, poses in self.poses.items():
                 poses.write(Path(folder) / name)
-            with zipfile.ZipFile(temporary, "w") as archive:
-                for name in ("description.txt", *self.poses):
-                    info = zipfile.ZipInfo(name)  # its time is fixed, so the same poses give the same bytes
-                    info.external_attr = 0o644 << 16
-                    archive.writestr(info, (Path(folder) / name).read_bytes(), zipfile.ZIP_DEFLATED)
+                contents[name] = (Path(folder) / name).read_bytes()
+        with write_atomic(self.path) as partial, zipfile.ZipFile(partial, "w") as archive:
+            for name, content in contents.items():
+                info = zipfile.ZipInfo(name)  # its time is fixed, so the same poses give the same bytes
+                info.external_attr = 0o644 << 16
+                archive.writestr(info, content, zipfile.ZIP_DEFLATED)
         write_csv(self.path.with_suffix(".csv"), self.queries)
         return self.path
 
@@ -91,10 +81,9 @@ def collect(
 ) -> Submission:  # fmt: skip
     """Collect and check the poses of runs for submission; `.write()` then writes the zip file.
 
-    The arguments are those of `visloc submit`. If the runs contain a scene of the challenge, all its scenes and pairs
-    are expected, else those of their captures. Raise ManifestError for an unknown value, run or description,
-    ArtifactError for two runs with one pair, outdated poses, a duplicate key or a wrong quaternion, and CaptureError
-    for a malformed file or no such keyframe list.
+    The arguments are those of `visloc submit`. With a scene of the challenge, all its scenes and pairs are expected,
+    else those of the captures. Raise ManifestError for an unknown value, run or description, ArtifactError for two runs
+    with one pair, outdated poses, a duplicate key or a wrong quaternion, CaptureError for a bad file or keyframe list.
     """
     require_known("failed", failed, FAILED)
     folders, stage = [Path(run) for run in runs], "sequence" if sequence else "localize"
@@ -138,39 +127,6 @@ def collect(
         text += f"{filled} of {pairs['asked'].sum()} queries {how}.\n"
     path, asked = Path(out or folders[0] / "submission.zip"), pd.concat(tables)[COLUMNS_OF_QUERIES]
     return Submission(path, text, poses, asked, pairs)
-
-
-@contextmanager
-def open_captures(
-    runs: Iterable[Path], given: Iterable[str | Path], scenes: Sequence[str]
-) -> Iterator[Callable[[str], Capture]]:
-    """Yield a function that opens a scene's capture, with the kinds of devices and the links of the runs' manifests.
-
-    Captures that have moved since are in the `given` folders, which have the names of scenes, else raise ManifestError.
-    """
-    folders, devices, outside = dict[str, Path](), [], False
-    for record in [read_json(run / "run.json") for run in runs]:
-        # Poses of another tool and stages run by hand have no such record: the user must give the captures.
-        with suppress(KeyError, TypeError):
-            folders |= {row["scene"]: Path(row["parameters"]["sessions_root"]).parent for row in record["stages"]}
-            devices += record["manifest"].get("extra_devices", [])
-            outside |= record["manifest"].get("allow_outside", False)
-    for path in map(Path.resolve, map(Path, given)):
-        if path.name not in scenes:
-            raise ManifestError(f"{path}: the folder has no scene's name. Expected {', '.join(scenes)}.")
-        folders[path.name] = path
-
-    @cache
-    def open_capture(scene: str) -> Capture:
-        if scene not in folders:
-            raise ManifestError(f"{scene}: the runs do not say where this capture is. Give it: --capture PATH/{scene}.")
-        try:
-            return Capture.open(folders[scene])
-        except CaptureError as error:
-            raise ManifestError(f"{scene}: {error} Give the folder: --capture PATH/{scene}.") from None
-
-    with extra_devices(devices), allow_outside(outside):
-        yield open_capture
 
 
 def _answers(

@@ -26,7 +26,9 @@ import yaml
 from filelock import SoftFileLock
 
 from toolkit import __version__
-from toolkit.errors import ManifestError, ToolkitError, exit_code, sentence
+from toolkit.capture import Capture
+from toolkit.capture.names import allow_outside, extra_devices
+from toolkit.errors import CaptureError, ManifestError, ToolkitError, exit_code, sentence
 from toolkit.files import (
     SceneFiles,
     environment_variable,
@@ -233,6 +235,39 @@ class RunLog:
         scenes = list(self.inputs)
         rows = [*self.rows, *self.earlier()]
         return sorted(rows, key=lambda row: (scenes.index(row["scene"]), STAGES.index(row["stage"])))
+
+
+@contextmanager
+def open_captures(
+    runs: Iterable[Path], given: Iterable[str | Path], scenes: Sequence[str]
+) -> Iterator[Callable[[str], Capture]]:
+    """Yield a function that opens a scene's capture, with the kinds of devices and the links of the runs' manifests.
+
+    Captures that have moved since are in the `given` folders, which have the names of scenes, else raise ManifestError.
+    """
+    folders, devices, outside = dict[str, Path](), [], False
+    for record in [read_json(run / "run.json") for run in runs]:
+        # Poses of another tool and stages run by hand have no such record: the user must give the captures.
+        with suppress(KeyError, TypeError):
+            folders |= {row["scene"]: Path(row["parameters"]["sessions_root"]).parent for row in record["stages"]}
+            devices += record["manifest"].get("extra_devices", [])
+            outside |= record["manifest"].get("allow_outside", False)
+    for path in map(Path.resolve, map(Path, given)):
+        if path.name not in scenes:
+            raise ManifestError(f"{path}: the folder has no scene's name. Expected {', '.join(scenes)}.")
+        folders[path.name] = path
+
+    @cache
+    def open_capture(scene: str) -> Capture:
+        if scene not in folders:
+            raise ManifestError(f"{scene}: the runs do not say where this capture is. Give it: --capture PATH/{scene}.")
+        try:
+            return Capture.open(folders[scene])
+        except CaptureError as error:
+            raise ManifestError(f"{scene}: {error} Give the folder: --capture PATH/{scene}.") from None
+
+    with extra_devices(devices), allow_outside(outside):
+        yield open_capture
 
 
 def failures(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
