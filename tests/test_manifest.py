@@ -1,5 +1,6 @@
 """The manifest: what is accepted, and that what is wrong is named with its place and the nearest key."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -168,7 +169,7 @@ def test_overrides_are_yaml_and_win(tmp_path: Path) -> None:
         ("captures: [a]\nretreive: {}", "unknown key 'retreive'. Did you mean 'retrieve'?"),
         (
             "captures: [here]\nlocalize: {pnp: {guided_images: 9}}",
-            "'localize.pnp.guided_images': it is no setting any more, but a constant in toolkit/pose/map_matching.py.",
+            "guided_images': it is no setting any more, but MAX_GUIDED_IMAGES in toolkit/pose/map_matching.py.",
         ),
         ("demo_data: {room: 1}", "unknown key 'demo_data.room'. Did you mean 'rooms'?"),
         ("captures: [a]\nretrieve: {topk: ten}", "retrieve.topk: found 'ten'"),
@@ -312,8 +313,10 @@ def test_stages_have_few_settings_and_constants_are_where_they_are_said_to_be() 
     assert sum(len(section.model_fields) for section in sections) <= 90
     for section in sections:
         for file, names in section.constants.items():
-            assert (REPOSITORY / "toolkit" / file).is_file()
-            assert not {*names.split()} & {*section.model_fields}
+            code = (REPOSITORY / "toolkit" / file).read_text(encoding="utf-8")
+            for setting, _, constant in (one.partition("=") for one in names.split()):
+                assert setting not in section.model_fields
+                assert re.search(rf"^ *{constant or setting.upper()}(:.*)? = ", code, re.MULTILINE), setting
 
 
 def test_a_plain_value_stands_for_the_field_that_matters(tmp_path: Path) -> None:

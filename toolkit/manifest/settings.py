@@ -77,9 +77,10 @@ def explain(
 
 def _why_unknown(name: str, model: type[BaseModel]) -> str:
     """Return the end of a message: the file if a former setting is a constant now, else the known keys."""
-    files = [file for file, names in getattr(model, "constants", {}).items() if name in names.split()]
-    if files:
-        return f": it is no setting any more, but a constant in toolkit/{files[0]}."
+    for file, names in getattr(model, "constants", {}).items():
+        for setting, _, constant in (one.partition("=") for one in names.split()):
+            if setting == name:
+                return f": it is no setting any more, but {constant or name.upper()} in toolkit/{file}."
     return f". {nearest(name, model.model_fields)}"
 
 
@@ -144,7 +145,8 @@ class Settings(BaseModel):
     shorthand: ClassVar[str] = ""
     """Name of the field that a plain value sets: `matcher: mutual` means `matcher: {name: mutual}`."""
     constants: ClassVar[dict[str, str]] = {}
-    """Former settings that are constants now, by their file in `toolkit/`, which the error for such a key names."""
+    """Former settings that are constants now, by their file in `toolkit/`, for the errors of such keys. The constant
+    has the name of the setting in capitals, or the one after `=`."""
 
     @model_validator(mode="before")
     @classmethod
@@ -253,7 +255,7 @@ class ExploreSettings(Settings):
 class EmbedSettings(Settings):
     """Global descriptors of the images."""
 
-    constants = {"embedders/vlad.py": "vlad"}
+    constants = {"embedders/vlad.py": "vlad=MAX_WORDS"}
     model: Annotated[str | list[str], AfterValidator(_check_models)] = "vlad"
     """Global descriptor: vlad (needs no weights), megaloc, or auto (megaloc if its weights are available, else vlad).
     A list such as [megaloc, vlad] fuses the similarities by their generalized harmonic mean."""
@@ -297,7 +299,7 @@ class MaskSettings(Settings):
     prior without information, or one that contradicts those before it, is ignored.
     """
 
-    constants = {"retrieve.py": "poses_angle_deg gps_margin_m radio_share window_s"}
+    constants = {"retrieve.py": "poses_angle_deg=MAX_ANGLE_DEG gps_margin_m radio_share window_s"}
     poses: str | None = None
     """File with rough poses of the query devices in the map's frame, in the format of trajectories.txt; restricts the
     search to map images near these poses. null: no such prior."""
@@ -337,7 +339,7 @@ class RetrieveSettings(Settings):
 class SiftSettings(Settings):
     """SIFT keypoints and descriptors."""
 
-    constants = {"features/features.py": "contrast_threshold"}
+    constants = {"features/features.py": "contrast_threshold=MIN_CONTRAST"}
     min_long_side: Natural = 640
     """Before detection, smaller images are enlarged to this length of the longer side, pixels."""
     max_long_side: Positive = 1280
@@ -349,7 +351,7 @@ class SiftSettings(Settings):
 class SuperPointSettings(Settings):
     """SuperPoint keypoints and descriptors."""
 
-    constants = {"features/network.py": "threshold nms_radius border"}
+    constants = {"features/network.py": "threshold=min_response nms_radius=nms_radius border=border"}
     max_long_side: Annotated[int, Field(ge=8)] = 1024
     """Larger images are reduced to this length of the longer side, pixels; the aspect ratio is kept."""
     max_keypoints: Positive = 2048
@@ -362,7 +364,7 @@ AlikedModel = Literal["aliked-n16", "aliked-n16rot", "aliked-n32", "aliked-t16"]
 class AlikedSettings(Settings):
     """ALIKED keypoints and descriptors."""
 
-    constants = {"features/network.py": "min_long_side threshold nms_radius"}
+    constants = {"features/network.py": "min_long_side=min_long_side threshold=min_score nms_radius=nms_radius"}
     model: AlikedModel = "aliked-n16"
     """Variant of the network: n16rot tolerates more in-plane rotation, n32 is larger, t16 is smaller."""
     max_long_side: Annotated[int, Field(ge=32)] = 1024
@@ -512,10 +514,10 @@ class PnpSettings(Settings):
 
     constants = {
         "pose/pnp.py": "clear_inlier_ratio contested_inlier_ratio contested_references "
-        "guided_radii_deg max_guided_matches ok_rival_support",
-        "pose/base.py": "max_ransac_matches ransac_max_trials",
-        "pose/map_matching.py": "guided_images max_map_features max_query_features",
-        "scene/map.py": "sure_position_std_m",
+        "guided_radii_deg max_guided_matches ok_rival_support=MAX_RIVAL_SUPPORT",
+        "pose/base.py": "max_ransac_matches ransac_max_trials=MAX_RANSAC_TRIALS",
+        "pose/map_matching.py": "guided_images=MAX_GUIDED_IMAGES max_map_features max_query_features",
+        "scene/map.py": "sure_position_std_m=MAX_SURE_STD_M",
     }
     ransac_max_error_deg: PositiveNumber = 0.45
     """Largest reprojection error of an inlier, degrees."""
@@ -533,7 +535,7 @@ class PredictorSettings(Settings):
     """The feed-forward network that predicts cameras and depth from a query image and its references."""
 
     shorthand = "name"
-    constants = {"prediction/feed_forward.py": "depth_points least_points"}
+    constants = {"prediction/feed_forward.py": "depth_points=MAX_DEPTH_POINTS least_points=MIN_POINTS"}
     name: Literal["vggt", "vggt-omega", "da3-base", "da3-small", "simulated"] = "vggt"
     """Network of the methods `feed_forward` and `hybrid`. `simulated` looks up the true poses, for trials."""
     checkpoint: str | None = None
