@@ -28,6 +28,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -252,6 +253,10 @@ class Books:
             ("retrieve", self.retrieve),
             ("write poses", self.write_poses),
             ("evaluate", self.evaluate),
+            ("write features, shards of 64 MB", self.write_items),
+            ("open and read them", self.read_items),
+            ("write features, a file an image", self.write_files),
+            ("read these", self.read_files),
         ]
 
     def write(self) -> None:
@@ -406,6 +411,39 @@ class Books:
         folders = (self.run / name for name in ("poses", "retrieval", "evaluation"))
         evaluation = evaluate_scene(self.capture_dir / "sessions", *folders, queries="keyframes_pruned")
         assert evaluation.recall["localized"].sum() == len(self.capture["ios_query"].images)
+
+    def write_items(self) -> None:
+        from toolkit.store.items import Items
+
+        with Items(self.run / "items") as store:
+            for image in range(self.images):
+                store.add(str(image), "source", self.features, {})
+        print(f"{self.images} items: {sum(1 for _ in (self.run / 'items').iterdir())} files", flush=True)
+
+    def read_items(self) -> None:
+        from toolkit.store.items import Items
+
+        store = Items(self.run / "items")
+        assert all(len(store[str(image)]["keypoints"]) == 1000 for image in range(self.images))
+
+    def write_files(self) -> None:
+        from toolkit.files import write_atomic
+
+        for image in range(self.images):
+            with write_atomic(self.run / "files" / f"{image}.npz") as temporary, open(temporary, "wb") as stream:
+                np.savez(stream, allow_pickle=False, **self.features)
+
+    def read_files(self) -> None:
+        for image in range(self.images):
+            with np.load(self.run / "files" / f"{image}.npz") as stored:
+                assert all(len(stored[name]) == 1000 for name in stored.files)
+
+    @cached_property
+    def features(self) -> dict[str, np.ndarray]:
+        """As many random numbers as 1,000 SIFT features have, 136 kB."""
+        rng = np.random.default_rng(0)
+        descriptors = rng.integers(0, 255, (1000, 128), np.uint8)
+        return {"keypoints": rng.standard_normal((1000, 2), np.float32), "descriptors": descriptors}
 
 
 def keep_books(folder: Path, images: int) -> dict[str, dict[str, float]]:
