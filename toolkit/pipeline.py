@@ -439,7 +439,7 @@ def _build_maps(manifest: Manifest, run_dir: Path, say: Say) -> None:
     captures = _captures(manifest)
     _, record = _jobs(manifest, captures, [], run_dir, False)
     if manifest.rerank is not None:
-        say("rerank: not used for photographs that are localized in a map by itself")
+        say("rerank: not used for images that are localized in a map by itself")
         manifest = manifest.model_copy(update={"rerank": None})
     embed = EmbedSettings.of(manifest.stage("embed"))
     retrieve = RetrieveSettings.of(manifest.stage("retrieve"))

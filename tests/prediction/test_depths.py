@@ -119,7 +119,7 @@ def test_without_the_sensors_own_time_depth_would_be_wrong(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
-        ({"offset_us": MAX_OFFSET_US + 1}, "no depth map of this photograph"),
+        ({"offset_us": MAX_OFFSET_US + 1}, "no depth map of this image"),
         ({"offset_us": -OFFSET}, "has no pose at that time"),
         ({"poses": False}, "has no pose at that time"),
     ],
@@ -198,7 +198,7 @@ def test_a_session_without_depth_maps(tmp_path: Path) -> None:
     write_session(tmp_path / "ios_map", [("c", "", "camera", "SIMPLE_PINHOLE", 8, 6, 5, 4, 3)], None, None,
                   [(1, "c", "1.jpg")])  # fmt: skip
     seen = DepthMaps(Session.open(tmp_path / "ios_map")).of(0)
-    assert seen.reason == "no depth map of this photograph"
+    assert seen.reason == "no depth map of this image"
 
 
 def test_the_largest_number_of_a_depth_map_is_unknown(tmp_path: Path) -> None:

@@ -545,7 +545,7 @@ def export_exif(
     if xmp:
         names = names.map(lambda name: PurePosixPath(name).with_suffix(".xmp").as_posix())
         if names.duplicated().any():
-            raise ManifestError(f"xmp: two pictures would have the file {names[names.duplicated()].iloc[0]}.")
+            raise ManifestError(f"xmp: two images would have the file {names[names.duplicated()].iloc[0]}.")
     with write_folder(out) as folder:
         for name, row in zip(names, table.to_dict("records"), strict=True):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -21,8 +21,8 @@ from toolkit.files import IMPORTED, own_name, read_json
 from toolkit.geometry import Floats, invert
 
 MAX_ERRORS_M = (0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
-"""Limits of the error of a known position; the smallest that `MOST` of the positions meet is used."""
-MOST = 0.6  # of the positions; the others may be blunders
+"""Limits of the error of a known position; the smallest that `MIN_AGREEING` of the positions meet is used."""
+MIN_AGREEING = 0.6  # of the positions; the others may be blunders
 OUTLIER = 2.5  # smallest error of an outlier, in multiples of the median; for Gaussian noise, 3.8 standard deviations
 MAX_SCALE_DEVIATION = 0.1  # largest relative standard deviation of a scale that is used
 MAX_TILT_DEG = 2.0  # largest standard deviation of the vertical by known positions; else the cameras tell it
@@ -174,7 +174,7 @@ def fit(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, Floats, float, 
     for max_error in MAX_ERRORS_M:
         options = pycolmap.RANSACOptions(max_error=max_error, random_seed=0)
         found: Any = pycolmap.estimate_sim3d_robust(source, target, options)
-        if found is not None and found["num_inliers"] >= max(3, MOST * len(source)):
+        if found is not None and found["num_inliers"] >= max(3, MIN_AGREEING * len(source)):
             break
     else:
         return None

@@ -174,7 +174,7 @@ class DepthMaps:
                 continue
             world_from_depth = self._pose(depth_id, nearest[0])
             if world_from_depth is None or not np.isfinite(world_from_cam).all():
-                missing = "its sensor" if world_from_depth is None else "the photograph"
+                missing = "its sensor" if world_from_depth is None else "the image"
                 reasons.append(f"depth map {nearest[1]}: {missing} has no pose at that time or near it")
                 continue
             cam_from_depth = geometry.invert(world_from_cam) @ world_from_depth
@@ -235,7 +235,7 @@ def _visible(points: Floats, camera: pycolmap.Camera, cell_px: float, reason: st
     inside = (np.isfinite(pixels) & (pixels >= 0) & (pixels < size)).all(axis=1)
     pixels, depth = pixels[inside], points[inside, 2]
     if not len(depth):
-        return SeenDepth(np.zeros((0, 2)), np.zeros(0), cell_px, reason or "no depth map of this photograph")
+        return SeenDepth(np.zeros((0, 2)), np.zeros(0), cell_px, reason or "no depth map of this image")
     column, row = (pixels / cell_px).astype(np.int64).T
     shape = tuple(int(n) + 1 for n in (size[::-1] / cell_px))
     cell = row * shape[1] + column
