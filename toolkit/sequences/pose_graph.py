@@ -61,22 +61,19 @@ class PlacedPiece:
     scale: float = 1.0
     """Scale factor of the odometry; online that of the last pose."""
 
+    @classmethod
+    def nowhere(cls, frames: int, queries: int, status: Status | None, reason: str = "") -> "PlacedPiece":
+        """Return a piece without poses."""
+        poses, covariances = (np.full((frames, size, size), np.nan) for size in (4, 6))
+        texts = np.array([status] * frames, object), np.full(frames, reason, object)
+        return cls(poses, covariances, np.zeros(queries, bool), *texts)
+
 
 def place_online(odometry: Odometry, queries: PosedQueries, frames: Ints, settings: SequenceSettings) -> PlacedPiece:
     """Return the poses of some frames of a piece, each only from the last `settings.length_s` seconds before it."""
-    length_us = np.inf if settings.length_s is None else settings.length_s * 1e6
-    count = len(odometry)
-    piece = PlacedPiece(
-        np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan), np.zeros(len(queries), bool),
-        np.full(count, None, object), np.full(count, "", object),
-    )  # fmt: skip
+    piece = PlacedPiece.nowhere(len(odometry), len(queries), None)
     for frame in frames.tolist():
-        start = int(np.searchsorted(odometry.timestamps, odometry.timestamps[frame] - length_us))
-        within = slice(start, frame + 1)
-        past, chosen = odometry.part(within), queries.part(within)
-        drifting = with_measured_drift([(past, chosen)], settings)
-        last = cut(past, chosen, drifting)[-1]  # the part after the last loss of tracking
-        past, chosen = past.part(last), chosen.part(last)
+        past, chosen, drifting = latest(odometry.part(slice(0, frame + 1)), queries.part(slice(0, frame + 1)), settings)
         placed = place_piece(past, chosen, drifting)
         piece.world_from_rig[frame], piece.covariances[frame] = placed.world_from_rig[-1], placed.covariances[-1]
         piece.status[frame], piece.reason[frame] = placed.status[-1], placed.reason[-1]
@@ -85,12 +82,23 @@ def place_online(odometry: Odometry, queries: PosedQueries, frames: Ints, settin
     return piece
 
 
+def latest(
+    odometry: Odometry, queries: PosedQueries, settings: SequenceSettings
+) -> tuple[Odometry, PosedQueries, SequenceSettings]:
+    """Return the last `settings.length_s` seconds after the last loss of tracking, and settings of the drift there."""
+    times, length_s = odometry.timestamps, settings.length_s
+    past = slice(0 if length_s is None else int(np.searchsorted(times, times[-1] - length_s * 1e6)), len(times))
+    odometry, queries = odometry.part(past), queries.part(past)
+    settings = with_measured_drift([(odometry, queries)], settings)
+    last = cut(odometry, queries, settings)[-1]
+    return odometry.part(last), queries.part(last), settings
+
+
 def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> PlacedPiece:
     """Return the poses of a piece of odometry, from the poses of single queries in it."""
     count = len(odometry)
     if not len(queries):
-        nothing = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan), np.zeros(0, bool)
-        return PlacedPiece(*nothing, np.array([Status.FAILED] * count, object), np.full(count, NO_QUERY, object))
+        return PlacedPiece.nowhere(count, 0, Status.FAILED, NO_QUERY)
     best = place(odometry, queries, settings)[0]
     used, seen = best.members, set[bytes]()
     for _ in range(_ROUNDS):
@@ -217,14 +225,15 @@ def localize_piece(
     """Return the poses of a piece of odometry: of all frames, or only of the queries if `settings.online`.
 
     Of all `query_frames` (A,), ascending, those in `queries` have a pose. Those that are not `ok` or do not fit the
-    graph are localized by `relocalize`; None: they keep their poses. Raise ManifestError if GTSAM is not installed.
+    graph are localized by `relocalize`; None, or `settings.relocalize` is false: they keep their poses. Raise
+    ManifestError if GTSAM is not installed.
     """
     first = _placed(odometry, queries, query_frames, settings)
     sure = queries.frames[first.used & queries.trusted]
     predicted = query_frames[np.isfinite(first.world_from_rig[query_frames]).all(axis=(1, 2))]
     doubtful = np.setdiff1d(predicted, sure).tolist()
     relocalized: dict[int, QueryResult] = {}
-    if relocalize is not None and doubtful:
+    if settings.relocalize and relocalize is not None and doubtful:
         stds = zip(*(each.tolist() for each in stds_of(first.covariances[doubtful])), strict=True)
         rough = [RoughPose(pose, *std) for pose, std in zip(first.world_from_rig[doubtful], stds, strict=True)]
         relocalized = dict(zip(doubtful, relocalize(list(zip(doubtful, rough, strict=True))), strict=True))
@@ -242,6 +251,54 @@ def localize_piece(
             singles[frame] = estimate.world_from_rig
     steps = dict(zip(STEPS, (voted, graph, singles[query_frames]), strict=True))
     return LocalizedPiece(second, all_queries, relocalized, steps)
+
+
+def localize_frames(
+    odometry: Odometry,
+    parts: Sequence[slice],
+    queries: PosedQueries,
+    query_frames: Ints,
+    settings: SequenceSettings,
+    relocalize: Relocalize,
+) -> tuple[Ints, LocalizedPiece]:
+    """Return the poses of all frames of one or more recordings of a device.
+
+    Args:
+        odometry: the frames, recording after recording.
+        parts: slices of all frames in order, without a known loss of tracking; further losses that the queries show
+            are cut, unless `settings.online`.
+        queries, query_frames, relocalize: see `localize_piece`.
+
+    Returns:
+        The number (N,) of each frame's piece, and all pieces joined.
+
+    Raises:
+        ManifestError: GTSAM is not installed.
+    """
+    pieces = list(parts) or [slice(0, 0)]
+    if not settings.online:  # both use later frames
+        settings = with_measured_drift([(odometry.part(rows), queries.part(rows)) for rows in pieces], settings)
+        pieces = [
+            slice(rows.start + part.start, rows.start + part.stop)
+            for rows in pieces
+            for part in cut(odometry.part(rows), queries.part(rows), settings)
+        ]
+    done, all_queries, relocalized = list[LocalizedPiece](), queries_of({}), dict[int, QueryResult]()
+    for rows in pieces:
+
+        def again(todo: Sequence[tuple[int, RoughPose]], start: int = rows.start) -> Sequence[QueryResult]:
+            return relocalize([(start + frame, near) for frame, near in todo])
+
+        frames = query_frames[(query_frames >= rows.start) & (query_frames < rows.stop)] - rows.start
+        piece = localize_piece(odometry.part(rows), queries.part(rows), frames, settings, again)
+        done.append(piece)
+        all_queries = all_queries.joined(replace(piece.queries, frames=rows.start + piece.queries.frames))
+        relocalized |= {rows.start + frame: result for frame, result in piece.relocalized.items()}
+    names = ("world_from_rig", "covariances", "used", "status", "reason")
+    placed = PlacedPiece(*(np.concatenate([getattr(piece.placed, name) for piece in done]) for name in names))
+    steps = {name: np.concatenate([piece.steps[name] for piece in done]) for name in STEPS}
+    numbers = np.repeat(np.arange(len(pieces)), [rows.stop - rows.start for rows in pieces])
+    return numbers, LocalizedPiece(placed, all_queries, relocalized, steps)
 
 
 def _placed(odometry: Odometry, queries: PosedQueries, query_frames: Ints, settings: SequenceSettings) -> PlacedPiece:
