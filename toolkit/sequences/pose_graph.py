@@ -295,10 +295,10 @@ def localize_frames(
         all_queries = all_queries.joined(replace(piece.queries, frames=rows.start + piece.queries.frames))
         relocalized |= {rows.start + frame: result for frame, result in piece.relocalized.items()}
     names = ("world_from_rig", "covariances", "used", "status", "reason")
-    placed = PlacedPiece(*(np.concatenate([getattr(piece.placed, name) for piece in done]) for name in names))
+    placed: dict[str, Any] = {name: np.concatenate([getattr(piece.placed, name) for piece in done]) for name in names}
     steps = {name: np.concatenate([piece.steps[name] for piece in done]) for name in STEPS}
     numbers = np.repeat(np.arange(len(pieces)), [rows.stop - rows.start for rows in pieces])
-    return numbers, LocalizedPiece(placed, all_queries, relocalized, steps)
+    return numbers, LocalizedPiece(PlacedPiece(**placed), all_queries, relocalized, steps)
 
 
 def _placed(odometry: Odometry, queries: PosedQueries, query_frames: Ints, settings: SequenceSettings) -> PlacedPiece:
