@@ -23,7 +23,7 @@ from toolkit.sequences.pose_graph import (
     NO_QUERY,
     PlacedPiece,
     is_sure,
-    latest,
+    latest_part,
     localize_frames,
     localize_piece,
     queries_of,
@@ -184,7 +184,7 @@ class SequenceLocalizer:
         return self._solve(image, cams)
 
     def _solve(self, image: Images, cameras: Cameras) -> QueryResult:
-        self._motion, self._queries, self._drift = latest(self._motion, self._queries, self.settings)
+        self._motion, self._queries, self._drift = latest_part(self._motion, self._queries, self.settings)
         offline = self._drift.model_copy(update={"online": False, "length_s": None})
 
         def relocalize(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:

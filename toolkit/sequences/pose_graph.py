@@ -9,7 +9,7 @@ https://gtsam.org).
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -60,6 +60,8 @@ class PlacedPiece:
     """(N,) texts, empty for `ok`."""
     scale: float = 1.0
     """Scale factor of the odometry; online that of the last pose."""
+    voters: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    """Queries that voted for this placement of the odometry; online none."""
 
     @classmethod
     def nowhere(cls, frames: int, queries: int, status: Status | None, reason: str = "") -> "PlacedPiece":
@@ -73,7 +75,9 @@ def place_online(odometry: Odometry, queries: PosedQueries, frames: Ints, settin
     """Return the poses of some frames of a piece, each only from the last `settings.length_s` seconds before it."""
     piece = PlacedPiece.nowhere(len(odometry), len(queries), None)
     for frame in frames.tolist():
-        past, chosen, drifting = latest(odometry.part(slice(0, frame + 1)), queries.part(slice(0, frame + 1)), settings)
+        past, chosen, drifting = latest_part(
+            odometry.part(slice(0, frame + 1)), queries.part(slice(0, frame + 1)), settings
+        )
         placed = place_piece(past, chosen, drifting)
         piece.world_from_rig[frame], piece.covariances[frame] = placed.world_from_rig[-1], placed.covariances[-1]
         piece.status[frame], piece.reason[frame] = placed.status[-1], placed.reason[-1]
@@ -82,7 +86,7 @@ def place_online(odometry: Odometry, queries: PosedQueries, frames: Ints, settin
     return piece
 
 
-def latest(
+def latest_part(
     odometry: Odometry, queries: PosedQueries, settings: SequenceSettings
 ) -> tuple[Odometry, PosedQueries, SequenceSettings]:
     """Return the last `settings.length_s` seconds after the last loss of tracking, and settings of the drift there."""
@@ -127,14 +131,13 @@ def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSet
         covariances[alone.frames] = bounded(alone.covariances)
     far = (status == Status.OK) & ~is_sure(covariances)
     status[far], reasons[far] = Status.LOW_CONFIDENCE, FAR
-    return PlacedPiece(poses, covariances, mask, status, reasons, scale)
+    return PlacedPiece(poses, covariances, mask, status, reasons, scale, best.members)
 
 
 def is_sure(covariances: Floats) -> NDArray[np.bool_]:
     """Return which poses (n,) are certain enough for `ok`, from their covariances (n, 6, 6)."""
-    variances = np.diagonal(covariances, axis1=1, axis2=2)
-    turns, shifts = variances[:, :3].sum(axis=1), variances[:, 3:].sum(axis=1)
-    return np.asarray((turns <= np.deg2rad(MAX_STD_DEG) ** 2) & (shifts <= MAX_STD_M**2))
+    rotation_std_deg, position_std_m = stds_of(covariances)
+    return np.asarray((rotation_std_deg <= MAX_STD_DEG) & (position_std_m <= MAX_STD_M))
 
 
 def _chi2(poses: Floats, covariances: Floats, queries: PosedQueries) -> Floats:
@@ -242,9 +245,9 @@ def localize_piece(
     singles = np.full((len(odometry), 4, 4), np.nan)
     singles[queries.frames] = queries.world_from_rig
     voted = np.full((len(query_frames), 4, 4), np.nan)
-    if len(queries) and not settings.online:
-        agreeing = queries.choose(place(odometry, queries, settings)[0].members)
-        voted = _median_placement(odometry, agreeing) @ odometry.odom_from_rig[query_frames]
+    if len(first.voters):
+        placement = _median_placement(odometry, queries.choose(first.voters))
+        voted = placement @ odometry.odom_from_rig[query_frames]
     graph = first.world_from_rig[query_frames]
     for frame, estimate in relocalized.items():
         if estimate.world_from_rig is not None:
@@ -277,12 +280,10 @@ def localize_frames(
     """
     pieces = list(parts) or [slice(0, 0)]
     if not settings.online:  # both use later frames
-        settings = with_measured_drift([(odometry.part(rows), queries.part(rows)) for rows in pieces], settings)
-        pieces = [
-            slice(rows.start + part.start, rows.start + part.stop)
-            for rows in pieces
-            for part in cut(odometry.part(rows), queries.part(rows), settings)
-        ]
+        of_parts = [(odometry.part(rows), queries.part(rows)) for rows in pieces]
+        settings = with_measured_drift(of_parts, settings)
+        cuts = zip(pieces, (cut(*of_part, settings) for of_part in of_parts), strict=True)
+        pieces = [slice(rows.start + at.start, rows.start + at.stop) for rows, within in cuts for at in within]
     done, all_queries, relocalized = list[LocalizedPiece](), queries_of({}), dict[int, QueryResult]()
     for rows in pieces:
 
