@@ -5,7 +5,7 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -45,7 +45,7 @@ from toolkit.sequences.odometry import (
     recordings_of,
     vote_weights,
 )
-from toolkit.sequences.pose_graph import localize_frames
+from toolkit.sequences.pose_graph import localize_pieces, pieces_of
 from toolkit.threads import fixed_sums
 
 log = logging.getLogger(__name__)
@@ -189,22 +189,22 @@ def _localize(
     _warn_of_ground_truth(session, motion, queries)
 
     relocalize = _Relocalizer(single.path, session, keys)
-    localize = partial(localize_frames, motion, parts, queries, asked, relocalize=relocalize)
-    piece, done = localize(settings)
-    placed, steps = done.placed, [_step_rows(keys.iloc[asked], piece[asked], done.steps)]
+    pieces, as_measured = pieces_of(motion, parts, queries, settings)
+    done = localize_pieces(motion, queries, asked, as_measured, relocalize, pieces)
+    placed, steps = done.placed, [_step_rows(keys.iloc[asked], done.piece[asked], done.steps)]
     if not settings.online:
         of_windows = dict[str, Floats]()
         for length_s in (*WINDOWS_S, None):
-            # Without poses found again near a predicted pose, because later queries helped to predict them.
-            past = settings.model_copy(update={"online": True, "length_s": length_s, "relocalize": False})
-            part, online = localize(past)
+            past = settings.model_copy(update={"online": True, "length_s": length_s})
             name = "online" if length_s is None else f"online {length_s:g} s"
+            # Not localized again, because later queries helped to predict the poses.
+            online = localize_pieces(motion, queries, asked, past, None, parts)
             of_windows[name] = online.placed.world_from_rig[asked]
-        steps.append(_step_rows(keys.iloc[asked], part[asked], of_windows))
+        steps.append(_step_rows(keys.iloc[asked], online.piece[asked], of_windows))
 
     frames = keys.reindex(columns=list(COLUMNS)).astype(object)
-    first = pd.Series(piece).groupby(keys["recording"]).transform("min")
-    frames["piece"] = (piece - first).astype(object)
+    first_piece = pd.Series(done.piece).groupby(keys["recording"]).transform("min")
+    frames["piece"] = (done.piece - first_piece).astype(object)
     verdicts = zip(placed.status, placed.reason, strict=True)
     frames["status"] = [verdict.text(reason) if verdict else "" for verdict, reason in verdicts]
     frames["single_status"] = np.append(status, "")[query]

@@ -24,8 +24,8 @@ from toolkit.sequences.pose_graph import (
     PlacedPiece,
     is_sure,
     latest_part,
-    localize_frames,
-    localize_piece,
+    localize_pieces,
+    pieces_of,
     queries_of,
 )
 from toolkit.threads import fixed_sums
@@ -114,11 +114,12 @@ def localize_sequence(
     def relocalize(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
         return [localize(images[frame], cams_of_frames[frame], near) for frame, near in todo]
 
-    asked = np.array(list(single), np.int64)
-    piece, done = localize_frames(odometry, odometry.split(), queries_of(single), asked, settings, relocalize)
+    queries, asked = queries_of(single), np.array(list(single), np.int64)
+    pieces, settings = pieces_of(odometry, odometry.split(), queries, settings)
+    done = localize_pieces(odometry, queries, asked, settings, relocalize, pieces)
     placed = done.placed
     poses = placed.world_from_rig, placed.covariances, placed.status, placed.reason
-    return LocalizedFrames(*poses, piece, single, dict(done.relocalized))
+    return LocalizedFrames(*poses, done.piece, single, done.relocalized)
 
 
 class SequenceLocalizer:
@@ -190,7 +191,7 @@ class SequenceLocalizer:
         def relocalize(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
             return [self._localize(image, cameras, near) for _, near in todo]
 
-        done = localize_piece(self._motion, self._queries, np.array([len(self._motion) - 1]), offline, relocalize)
+        done = localize_pieces(self._motion, self._queries, np.array([len(self._motion) - 1]), offline, relocalize)
         self._queries, placed = done.queries, done.placed
         self._solved = len(self._motion) - 1, placed
         return self._estimate(placed.world_from_rig[-1], placed.covariances[-1], placed.status[-1], placed.reason[-1])

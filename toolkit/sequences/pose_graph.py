@@ -9,7 +9,7 @@ https://gtsam.org).
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -58,17 +58,28 @@ class PlacedPiece:
     """(N,) `Status`; online None for frames without a query."""
     reason: NDArray[np.object_]
     """(N,) texts, empty for `ok`."""
+    voted: Floats
+    """(N, 4, 4) world_from_rig by rigid odometry, placed where most queries agree; NaN online and without a query."""
     scale: float = 1.0
     """Scale factor of the odometry; online that of the last pose."""
-    voters: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    """Queries that voted for this placement of the odometry; online none."""
+
+    def __len__(self) -> int:
+        return len(self.status)
 
     @classmethod
     def nowhere(cls, frames: int, queries: int, status: Status | None, reason: str = "") -> "PlacedPiece":
         """Return a piece without poses."""
         poses, covariances = (np.full((frames, size, size), np.nan) for size in (4, 6))
         texts = np.array([status] * frames, object), np.full(frames, reason, object)
-        return cls(poses, covariances, np.zeros(queries, bool), *texts)
+        return cls(poses, covariances, np.zeros(queries, bool), *texts, poses.copy())
+
+    @classmethod
+    def joined(cls, pieces: "Sequence[PlacedPiece]") -> "PlacedPiece":
+        """Return several pieces as one, with the scale of the last."""
+        joined: dict[str, Any] = dict(vars(pieces[-1]))
+        for name in joined.keys() - {"scale"}:
+            joined[name] = np.concatenate([vars(piece)[name] for piece in pieces])
+        return cls(**joined)
 
 
 def place_online(odometry: Odometry, queries: PosedQueries, frames: Ints, settings: SequenceSettings) -> PlacedPiece:
@@ -131,7 +142,8 @@ def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSet
         covariances[alone.frames] = bounded(alone.covariances)
     far = (status == Status.OK) & ~is_sure(covariances)
     status[far], reasons[far] = Status.LOW_CONFIDENCE, FAR
-    return PlacedPiece(poses, covariances, mask, status, reasons, scale, best.members)
+    voted = _median_placement(odometry, queries.choose(best.members)) @ odometry.odom_from_rig
+    return PlacedPiece(poses, covariances, mask, status, reasons, voted, scale)
 
 
 def is_sure(covariances: Floats) -> NDArray[np.bool_]:
@@ -200,13 +212,16 @@ Relocalize = Callable[[Sequence[tuple[int, RoughPose]]], Sequence[QueryResult]]
 
 
 @dataclass(frozen=True)
-class LocalizedPiece:
-    """The poses of a piece of odometry, and the intermediate results."""
+class LocalizedPieces:
+    """The poses of the frames of one or more pieces of odometry, and the intermediate results."""
 
     placed: PlacedPiece
+    """All pieces joined."""
+    piece: Ints
+    """(N,) number of each frame's piece."""
     queries: PosedQueries
     """The single poses of the final graph: the first ones and those found again."""
-    relocalized: Mapping[int, QueryResult]
+    relocalized: dict[int, QueryResult]
     """Estimates of the queries that were localized again near their predicted pose, by frame."""
     steps: Mapping[str, Floats]
     """world_from_rig (A, 4, 4) of the query frames after each of `STEPS`, NaN for none."""
@@ -217,21 +232,48 @@ STEPS = ("voted", "graph", "again")
 after doubtful queries were localized again. The second pose graph gives the result."""
 
 
+def pieces_of(
+    odometry: Odometry, parts: Sequence[slice], queries: PosedQueries, settings: SequenceSettings
+) -> tuple[list[slice], SequenceSettings]:
+    """Return the pieces of a device's recordings, and settings with the drift that the queries show.
+
+    `parts` are all frames in order, without a loss of tracking that odometry itself shows. Unless `settings.online`,
+    they are cut at those that the queries show.
+    """
+    if settings.online:  # both use later frames
+        return list(parts), settings
+    of_parts = [(odometry.part(rows), queries.part(rows)) for rows in parts]
+    settings = with_measured_drift(of_parts, settings)
+    cuts = zip(parts, (cut(*of_part, settings) for of_part in of_parts), strict=True)
+    return [slice(rows.start + at.start, rows.start + at.stop) for rows, within in cuts for at in within], settings
+
+
 @fixed_sums
-def localize_piece(
+def localize_pieces(
     odometry: Odometry,
     queries: PosedQueries,
     query_frames: Ints,
     settings: SequenceSettings,
     relocalize: Relocalize | None = None,
-) -> LocalizedPiece:
-    """Return the poses of a piece of odometry: of all frames, or only of the queries if `settings.online`.
+    pieces: Sequence[slice] = (),
+) -> LocalizedPieces:
+    """Return the poses of pieces of odometry: of all frames, or only of the queries if `settings.online`.
 
     Of all `query_frames` (A,), ascending, those in `queries` have a pose. Those that are not `ok` or do not fit the
-    graph are localized by `relocalize`; None, or `settings.relocalize` is false: they keep their poses. Raise
-    ManifestError if GTSAM is not installed.
+    graph are localized by `relocalize`; None, or `settings.relocalize` is false: they keep their poses. `pieces` are
+    all frames in order; none: the odometry is one piece. Raise ManifestError if GTSAM is not installed.
     """
-    first = _placed(odometry, queries, query_frames, settings)
+    pieces = pieces or [slice(0, len(odometry))]
+
+    def placed(queries: PosedQueries, rows: slice) -> PlacedPiece:
+        of_piece = odometry.part(rows), queries.part(rows)
+        if not settings.online:
+            return place_piece(*of_piece, settings)
+        within = (query_frames >= rows.start) & (query_frames < rows.stop)
+        return place_online(*of_piece, query_frames[within] - rows.start, settings)
+
+    each = [placed(queries, rows) for rows in pieces]
+    first = PlacedPiece.joined(each)
     sure = queries.frames[first.used & queries.trusted]
     predicted = query_frames[np.isfinite(first.world_from_rig[query_frames]).all(axis=(1, 2))]
     doubtful = np.setdiff1d(predicted, sure).tolist()
@@ -241,71 +283,17 @@ def localize_piece(
         rough = [RoughPose(pose, *std) for pose, std in zip(first.world_from_rig[doubtful], stds, strict=True)]
         relocalized = dict(zip(doubtful, relocalize(list(zip(doubtful, rough, strict=True))), strict=True))
     all_queries = with_relocalized(queries, relocalized)
-    second = first if all_queries is queries else _placed(odometry, all_queries, query_frames, settings)
+    for number, rows in enumerate(pieces):
+        if any(rows.start <= frame < rows.stop for frame in relocalized):
+            each[number] = placed(all_queries, rows)
     singles = np.full((len(odometry), 4, 4), np.nan)
     singles[queries.frames] = queries.world_from_rig
-    voted = np.full((len(query_frames), 4, 4), np.nan)
-    if len(first.voters):
-        placement = _median_placement(odometry, queries.choose(first.voters))
-        voted = placement @ odometry.odom_from_rig[query_frames]
-    graph = first.world_from_rig[query_frames]
     for frame, estimate in relocalized.items():
         if estimate.world_from_rig is not None:
             singles[frame] = estimate.world_from_rig
-    steps = dict(zip(STEPS, (voted, graph, singles[query_frames]), strict=True))
-    return LocalizedPiece(second, all_queries, relocalized, steps)
-
-
-def localize_frames(
-    odometry: Odometry,
-    parts: Sequence[slice],
-    queries: PosedQueries,
-    query_frames: Ints,
-    settings: SequenceSettings,
-    relocalize: Relocalize,
-) -> tuple[Ints, LocalizedPiece]:
-    """Return the poses of all frames of one or more recordings of a device.
-
-    Args:
-        odometry: the frames, recording after recording.
-        parts: slices of all frames in order, without a known loss of tracking; further losses that the queries show
-            are cut, unless `settings.online`.
-        queries, query_frames, relocalize: see `localize_piece`.
-
-    Returns:
-        The number (N,) of each frame's piece, and all pieces joined.
-
-    Raises:
-        ManifestError: GTSAM is not installed.
-    """
-    pieces = list(parts) or [slice(0, 0)]
-    if not settings.online:  # both use later frames
-        of_parts = [(odometry.part(rows), queries.part(rows)) for rows in pieces]
-        settings = with_measured_drift(of_parts, settings)
-        cuts = zip(pieces, (cut(*of_part, settings) for of_part in of_parts), strict=True)
-        pieces = [slice(rows.start + at.start, rows.start + at.stop) for rows, within in cuts for at in within]
-    done, all_queries, relocalized = list[LocalizedPiece](), queries_of({}), dict[int, QueryResult]()
-    for rows in pieces:
-
-        def again(todo: Sequence[tuple[int, RoughPose]], start: int = rows.start) -> Sequence[QueryResult]:
-            return relocalize([(start + frame, near) for frame, near in todo])
-
-        frames = query_frames[(query_frames >= rows.start) & (query_frames < rows.stop)] - rows.start
-        piece = localize_piece(odometry.part(rows), queries.part(rows), frames, settings, again)
-        done.append(piece)
-        all_queries = all_queries.joined(replace(piece.queries, frames=rows.start + piece.queries.frames))
-        relocalized |= {rows.start + frame: result for frame, result in piece.relocalized.items()}
-    names = ("world_from_rig", "covariances", "used", "status", "reason")
-    placed: dict[str, Any] = {name: np.concatenate([getattr(piece.placed, name) for piece in done]) for name in names}
-    steps = {name: np.concatenate([piece.steps[name] for piece in done]) for name in STEPS}
-    numbers = np.repeat(np.arange(len(pieces)), [rows.stop - rows.start for rows in pieces])
-    return numbers, LocalizedPiece(PlacedPiece(**placed), all_queries, relocalized, steps)
-
-
-def _placed(odometry: Odometry, queries: PosedQueries, query_frames: Ints, settings: SequenceSettings) -> PlacedPiece:
-    if settings.online:
-        return place_online(odometry, queries, query_frames, settings)
-    return place_piece(odometry, queries, settings)
+    steps = (poses[query_frames] for poses in (first.voted, first.world_from_rig, singles))
+    of_steps, piece = dict(zip(STEPS, steps, strict=True)), np.repeat(np.arange(len(pieces)), [*map(len, each)])
+    return LocalizedPieces(PlacedPiece.joined(each), piece, all_queries, relocalized, of_steps)
 
 
 def _median_placement(odometry: Odometry, agreeing: PosedQueries) -> Floats:
