@@ -61,7 +61,7 @@ class PlacedPiece:
     voted: Floats
     """(N, 4, 4) world_from_rig by rigid odometry, placed where most queries agree; NaN online and without a query."""
     scale: float = 1.0
-    """Scale factor of the odometry; online that of the last pose."""
+    """Scale factor of the odometry; 1 online and of several pieces."""
 
     def __len__(self) -> int:
         return len(self.status)
@@ -75,25 +75,22 @@ class PlacedPiece:
 
     @classmethod
     def joined(cls, pieces: "Sequence[PlacedPiece]") -> "PlacedPiece":
-        """Return several pieces as one, with the scale of the last."""
-        joined: dict[str, Any] = dict(vars(pieces[-1]))
-        for name in joined.keys() - {"scale"}:
-            joined[name] = np.concatenate([vars(piece)[name] for piece in pieces])
-        return cls(**joined)
+        """Return several pieces as one."""
+        names = vars(pieces[0]).keys() - {"scale"}
+        joined: dict[str, Any] = {name: np.concatenate([vars(piece)[name] for piece in pieces]) for name in names}
+        return cls(**joined) if len(pieces) > 1 else pieces[0]
 
 
 def place_online(odometry: Odometry, queries: PosedQueries, frames: Ints, settings: SequenceSettings) -> PlacedPiece:
     """Return the poses of some frames of a piece, each only from the last `settings.length_s` seconds before it."""
     piece = PlacedPiece.nowhere(len(odometry), len(queries), None)
     for frame in frames.tolist():
-        past, chosen, drifting = latest_part(
-            odometry.part(slice(0, frame + 1)), queries.part(slice(0, frame + 1)), settings
-        )
+        until = slice(0, frame + 1)
+        past, chosen, drifting = latest_part(odometry.part(until), queries.part(until), settings)
         placed = place_piece(past, chosen, drifting)
         piece.world_from_rig[frame], piece.covariances[frame] = placed.world_from_rig[-1], placed.covariances[-1]
         piece.status[frame], piece.reason[frame] = placed.status[-1], placed.reason[-1]
         piece.used[queries.frames == frame] = placed.used[chosen.frames == len(past) - 1]
-        piece = replace(piece, scale=placed.scale)
     return piece
 
 
@@ -208,7 +205,7 @@ def _rigid(pose: Floats) -> Floats:
 
 
 Relocalize = Callable[[Sequence[tuple[int, RoughPose]]], Sequence[QueryResult]]
-"""Function that localizes queries again: takes (frame in the piece, predicted pose) pairs, returns their estimates."""
+"""Function that localizes queries again: takes (frame, predicted pose) pairs, returns their estimates."""
 
 
 @dataclass(frozen=True)
@@ -279,7 +276,7 @@ def localize_pieces(
     doubtful = np.setdiff1d(predicted, sure).tolist()
     relocalized: dict[int, QueryResult] = {}
     if settings.relocalize and relocalize is not None and doubtful:
-        stds = zip(*(each.tolist() for each in stds_of(first.covariances[doubtful])), strict=True)
+        stds = zip(*(values.tolist() for values in stds_of(first.covariances[doubtful])), strict=True)
         rough = [RoughPose(pose, *std) for pose, std in zip(first.world_from_rig[doubtful], stds, strict=True)]
         relocalized = dict(zip(doubtful, relocalize(list(zip(doubtful, rough, strict=True))), strict=True))
     all_queries = with_relocalized(queries, relocalized)
