@@ -127,6 +127,15 @@ def test_a_query_without_odometry_keeps_its_own_pose(place: Path, tmp_path: Path
     assert pd.isna(row["recording"])
 
 
+def test_without_a_frame_of_odometry_all_queries_keep_their_poses(place: Path, tmp_path: Path) -> None:
+    odometry = place / "sessions/ios_query/trajectories.txt"
+    odometry.write_text(odometry.read_text().splitlines(keepends=True)[0])
+    done = sequence_pairs(place / "sessions", tmp_path / "poses", map_device="ios", query_device="ios").iloc[0]
+    single = Trajectory.read(tmp_path / "poses" / f"{pair_name(place.name, 'ios', 'ios')}.txt")
+    assert done["frames"] == done["ok"] == len(single)
+    assert Trajectory.read(done["path"]).timestamps.tolist() == single.timestamps.tolist()
+
+
 def test_a_pair_without_queries_has_failed_frames_alone(place: Path, tmp_path: Path) -> None:
     truth = Session(place / "sessions/ios_query").ground_truth
     assert truth is not None

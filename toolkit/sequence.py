@@ -3,16 +3,15 @@
 import glob
 import logging
 import time
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from toolkit import geometry
 from toolkit.capture import Capture, Session, Trajectory
@@ -24,6 +23,7 @@ from toolkit.files import (
     file_fingerprint,
     is_current,
     map_record_path,
+    pair_devices,
     pair_name,
     read_map_record,
     read_sidecar,
@@ -41,13 +41,11 @@ from toolkit.sequences.odometry import (
     UNKNOWN_COVARIANCE,
     Odometry,
     PosedQueries,
-    cut,
     device_names,
     recordings_of,
     vote_weights,
-    with_measured_drift,
 )
-from toolkit.sequences.pose_graph import localize_piece, place_online
+from toolkit.sequences.pose_graph import localize_pieces, pieces_of
 from toolkit.threads import fixed_sums
 
 log = logging.getLogger(__name__)
@@ -151,14 +149,13 @@ def _place_pair(
         record["localize"] = read_sidecar(poses)
     skipped = skip_existing and is_current(out, record)
     if not skipped:
-        relocalizer = _Relocalizer(poses_dir, capture.name, map_device, session) if settings.relocalize else None
-        frames, steps, trajectory = _frames(session, _SingleQueries.of(PairResults.open(poses)), settings, relocalizer)
+        frames, steps, trajectory, met_a_bug = _localize(session, PairResults.open(poses), settings)
         unit = read_map_record(map_record_path(poses_dir, capture.name, map_device))["unit"]
         csvs = {out.with_suffix(".csv"): in_unit_of_poses(frames, unit), out.with_name(f"{out.stem}_steps.csv"): steps}
         for path, rows in csvs.items():
             write_csv(path, rows)
         trajectory.write(out)
-        write_sidecar(out, record, list(csvs), made_from=inputs, unfinished=bool(relocalizer and relocalizer.met_a_bug))
+        write_sidecar(out, record, list(csvs), made_from=inputs, unfinished=met_a_bug)
     frames = pd.read_csv(out.with_suffix(".csv"), keep_default_na=False)
     return {
         "frames": len(frames),
@@ -173,189 +170,117 @@ def _place_pair(
     }
 
 
-@dataclass(frozen=True)
-class _Piece:
-    """A piece of a recording's odometry, N frames."""
+def _localize(
+    session: Session, single: PairResults, settings: SequenceSettings
+) -> tuple[pd.DataFrame, pd.DataFrame, Trajectory, bool]:
+    """Localize the frames of a session's recordings, and keep the poses of queries without odometry.
 
-    recording: str
-    device_ids: NDArray[np.object_]
-    """(N,)."""
-    motion: Odometry
-    query: Ints
-    """(N,) index of each frame's query, -1 for none."""
-    posed: PosedQueries
-    """The queries that have a pose."""
+    Return the table of all frames, the table of steps, the trajectory of the frames with a pose, and whether a query
+    failed with an internal error, so that the next run must try it again.
+    """
+    rows = single.table.drop_duplicates(["timestamp", "device_id"], ignore_index=True)
+    all_queries, status = _queries(replace(single, table=rows)), rows["status"].to_numpy(object)
+    keys, motion, parts = _recordings(session, rows)
+    index = KeyIndex(rows["timestamp"].to_numpy(), as_strings(rows["device_id"]))
+    query = index.find(motion.timestamps, as_strings(keys["device_id"]))  # of each frame, -1 for none
+    asked = np.flatnonzero(query >= 0)
+    posed = asked[np.isfinite(all_queries.world_from_rig[query[asked]]).all(axis=(1, 2))]
+    queries = replace(all_queries.choose(query[posed]), frames=posed)
+    _warn_of_ground_truth(session, motion, queries)
 
-    @property
-    def query_frames(self) -> Ints:
-        """(A,) frames of all queries."""
-        return np.flatnonzero(self.query >= 0)
-
-    def part(self, rows: slice) -> "_Piece":
-        device_ids, posed = self.device_ids[rows], self.posed.part(rows)
-        return _Piece(self.recording, device_ids, self.motion.part(rows), self.query[rows], posed)
-
-
-@dataclass(frozen=True)
-class _SingleQueries:
-    """Q queries with the results of the localize stage."""
-
-    keys: pd.DataFrame
-    """Table [timestamp, device_id]."""
-    status: NDArray[np.object_]
-    results: PosedQueries
-    """Of all queries, NaN for one without a pose; `frames` counts the queries."""
-
-    @classmethod
-    def of(cls, results: PairResults) -> "_SingleQueries":
-        rows = results.table.drop_duplicates(["timestamp", "device_id"], ignore_index=True)
-        results = replace(results, table=rows)
-        status = rows["status"].to_numpy(object)
-        evidence = rows.reindex(columns=["p_correct", "rival_support"]).to_numpy(float)
-        ok = (statuses(rows["status"]) == Status.OK).to_numpy(bool)
-        known = np.asarray(np.isfinite(results.covariances).all(axis=(1, 2)), bool)
-        covariances = np.asarray(np.where(known[:, None, None], results.covariances, UNKNOWN_COVARIANCE))
-        queries = PosedQueries(np.arange(len(rows)), results.poses, covariances, vote_weights(ok, *evidence.T), ok)
-        return cls(rows[["timestamp", "device_id"]], status, queries)
-
-    def posed(self, rows: Ints) -> PosedQueries:
-        """Return the queries with a pose among the frames of a piece; rows (N,) are the query of each, -1 for none."""
-        frames = np.flatnonzero(rows >= 0)
-        frames = frames[np.isfinite(self.results.world_from_rig[rows[frames]]).all(axis=(1, 2))]
-        return replace(self.results.choose(rows[frames]), frames=frames)
-
-    @cached_property
-    def index(self) -> KeyIndex:
-        return KeyIndex(self.keys["timestamp"].to_numpy(), as_strings(self.keys["device_id"]))
-
-
-class _Relocalizer:
-    """Localizes queries again near predicted poses, in the map of the run that made the first poses."""
-
-    def __init__(self, poses_dir: Path, scene: str, map_device: str, session: Session) -> None:
-        self._run, self._scene, self._device, self._session = poses_dir.parent.parent, scene, map_device, session
-        self._expected = poses_dir
-        self.met_a_bug = False
-        """Whether a query failed with an internal error, so that the next run must try it again."""
-
-    @cached_property
-    def _map(self) -> Map:
-        if SceneFiles(self._run, self._scene).poses_dir != self._expected:
-            expected = f"RUN/{self._scene}/poses, in a run folder whose map can be opened to localize queries again"
-            do = "Write the poses there, or set relocalize: false."
-            raise ArtifactError.at(self._expected, expected=expected, do=do)
-        return Map.open(self._run, self._scene, self._device)
-
-    def __call__(self, keys: pd.DataFrame, todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
-        """Localize frames again, each near a pose.
-
-        Args:
-            keys: table [timestamp, device_id] of all frames of the piece.
-            todo: frames and their predicted poses.
-        """
-        self._map.load()
-        rows_of_each = self._session.rows_of_keyframes(keys.iloc[[frame for frame, _ in todo]])
-
-        def localize(number: int) -> QueryResult:
-            rows = rows_of_each[number]
-            try:
-                return self._map.locate(self._map.query_of_session(self._session, rows), near=todo[number][1])
-            except Exception as error:  # one bad query never ends a run
-                path = self._session.image_path(int(rows[0]))
-                return QueryResult.failed(reason_of(error, f"localizing {path} again"))
-
-        results = list(prefetch(localize, range(len(todo)), default_workers()))
-        self.met_a_bug |= any(result.is_internal for result in results)
-        return results
-
-
-def _frames(
-    session: Session, singles: _SingleQueries, settings: SequenceSettings, relocalizer: _Relocalizer | None
-) -> tuple[pd.DataFrame, pd.DataFrame, Trajectory]:
-    """Return the table of all frames and queries, the table of steps, and the trajectory of the frames with a pose."""
-    tables, poses, covariances = list[pd.DataFrame](), list[Floats](), list[Floats]()
-    steps, online = [pd.DataFrame(columns=list(STEP_COLUMNS))], list[pd.DataFrame]()
-    with_odometry = np.zeros(len(singles.keys), bool)
-    pieces = list(_pieces(session, singles, settings))
-    _warn_of_ground_truth(session, pieces)
+    relocalize = _Relocalizer(single.path, session, keys)
+    pieces, as_measured = pieces_of(motion, parts, queries, settings)
+    done = localize_pieces(motion, queries, asked, as_measured, relocalize, pieces)
+    placed, steps = done.placed, [_step_rows(keys.iloc[asked], done.piece[asked], done.steps)]
     if not settings.online:
-        # Before drift is measured and pieces are cut, because both use later frames.
-        for piece in pieces:
-            online += _step_rows(piece, _online_steps(piece, settings))
-        settings = with_measured_drift([(piece.motion, piece.posed) for piece in pieces], settings)
-        pieces = [piece.part(rows) for piece in pieces for rows in cut(piece.motion, piece.posed, settings)]
-    numbers = Counter[str]()
-    for piece in pieces:
-        motion, queries, frames = piece.motion, piece.posed, piece.posed.frames
-        with_odometry[piece.query[piece.query_frames]] = True
-        keys = pd.DataFrame({"timestamp": motion.timestamps, "device_id": piece.device_ids})
-        relocalize = None if relocalizer is None else partial(relocalizer, keys)
-        done = localize_piece(motion, queries, piece.query_frames, settings, relocalize)
-        placed = done.placed
-        steps += _step_rows(piece, done.steps)
-        table = keys.reindex(columns=list(COLUMNS)).astype(object)
-        verdicts = zip(placed.status, placed.reason, strict=True)
-        table["status"] = [status.text(reason) if status else "" for status, reason in verdicts]
-        table["recording"], table["piece"] = piece.recording, numbers[piece.recording]
-        numbers[piece.recording] += 1
-        table["single_status"] = np.append(singles.status, "")[piece.query]
-        table.loc[list(done.relocalized), "again_status"] = [each.status_text for each in done.relocalized.values()]
-        turned, moved = pose_error(placed.world_from_rig[frames], queries.world_from_rig)
-        for name, values in (("moved_m", moved.round(6)), ("turned_deg", turned.round(6))):
-            table.loc[frames, name] = values
-        table.loc[done.queries.frames, "used"] = False
-        table.loc[done.queries.frames[placed.used], "used"] = True
-        tables.append(table)
-        poses.append(placed.world_from_rig)
-        covariances.append(placed.covariances)
-    alone = np.flatnonzero(~with_odometry)
-    table = singles.keys.iloc[alone].assign(status=singles.status[alone], single_status=singles.status[alone])
-    tables.append(table.reindex(columns=list(COLUMNS)))
-    all_poses = np.concatenate([*poses, singles.results.world_from_rig[alone]])
-    all_covariances = np.concatenate([*covariances, singles.results.covariances[alone]])
-    frames_table = pd.concat([part.astype(object) for part in tables], ignore_index=True)
-    kept = (frames_table["status"] != "").to_numpy()  # online, only queries have a status
-    frames_table, all_poses, all_covariances = frames_table[kept], all_poses[kept], all_covariances[kept]
-    posed = np.isfinite(all_poses).all(axis=(1, 2))
-    for name, stds in zip(("rotation_std_deg", "position_std_m"), stds_of(all_covariances), strict=True):
-        frames_table[name] = np.where(posed, stds, np.nan).round(6)
-    with_pose = frames_table[posed]
-    times, device_ids = with_pose["timestamp"].to_numpy(np.int64), with_pose["device_id"].to_list()
-    trajectory = Trajectory.from_poses(times, device_ids, all_poses[posed], all_covariances[posed])
-    return frames_table, pd.concat([part.astype(object) for part in steps + online], ignore_index=True), trajectory
+        of_windows = dict[str, Floats]()
+        for length_s in (*WINDOWS_S, None):
+            past = settings.model_copy(update={"online": True, "length_s": length_s})
+            name = "online" if length_s is None else f"online {length_s:g} s"
+            # Not localized again, because later queries helped to predict the poses.
+            online = localize_pieces(motion, queries, asked, past, None, parts)
+            of_windows[name] = online.placed.world_from_rig[asked]
+        steps.append(_step_rows(keys.iloc[asked], online.piece[asked], of_windows))
+
+    frames = keys.reindex(columns=list(COLUMNS)).astype(object)
+    first_piece = pd.Series(done.piece).groupby(keys["recording"]).transform("min")
+    frames["piece"] = (done.piece - first_piece).astype(object)
+    verdicts = zip(placed.status, placed.reason, strict=True)
+    frames["status"] = [verdict.text(reason) if verdict else "" for verdict, reason in verdicts]
+    frames["single_status"] = np.append(status, "")[query]
+    frames.loc[list(done.relocalized), "again_status"] = [each.status_text for each in done.relocalized.values()]
+    turned, moved = pose_error(placed.world_from_rig[posed], queries.world_from_rig)
+    frames.loc[posed, "moved_m"], frames.loc[posed, "turned_deg"] = moved.round(6), turned.round(6)
+    frames.loc[done.queries.frames, "used"] = False
+    frames.loc[done.queries.frames[placed.used], "used"] = True
+    alone = np.setdiff1d(np.arange(len(rows)), query)
+    without = rows.loc[alone, ["timestamp", "device_id", "status"]].assign(single_status=status[alone])
+    frames = pd.concat([frames, without.astype(object)], ignore_index=True)
+    poses = np.concatenate([placed.world_from_rig, all_queries.world_from_rig[alone]])
+    covariances = np.concatenate([placed.covariances, all_queries.covariances[alone]])
+    kept = (frames["status"] != "").to_numpy()  # online, only queries have a status
+    frames, poses, covariances = frames[kept], poses[kept], covariances[kept]
+    has_pose = np.isfinite(poses).all(axis=(1, 2))
+    for name, stds in zip(("rotation_std_deg", "position_std_m"), stds_of(covariances), strict=True):
+        frames[name] = np.where(has_pose, stds, np.nan).round(6)
+    times, device_ids = (frames.loc[has_pose, name].to_list() for name in ("timestamp", "device_id"))
+    trajectory = Trajectory.from_poses(times, device_ids, poses[has_pose], covariances[has_pose])
+    return frames, pd.concat(steps), trajectory, any(result.is_internal for result in done.relocalized.values())
 
 
-def _step_rows(piece: _Piece, steps: Mapping[str, Floats]) -> Iterator[pd.DataFrame]:
-    """Yield a table with `STEP_COLUMNS` for each step, from the poses (A, 4, 4) of the piece's queries after it."""
+def _queries(single: PairResults) -> PosedQueries:
+    """Return all queries, NaN for one without a pose; `frames` counts them."""
+    ok = (statuses(single.table["status"]) == Status.OK).to_numpy(bool)
+    evidence = single.table.reindex(columns=["p_correct", "rival_support"]).to_numpy(float)
+    known = np.asarray(np.isfinite(single.covariances).all(axis=(1, 2)), bool)
+    covariances = np.asarray(np.where(known[:, None, None], single.covariances, UNKNOWN_COVARIANCE))
+    return PosedQueries(np.arange(len(ok)), single.poses, covariances, vote_weights(ok, *evidence.T), ok)
+
+
+def _recordings(session: Session, queries: pd.DataFrame) -> tuple[pd.DataFrame, Odometry, list[slice]]:
+    """Return the frames of a session's odometry, recording after recording; interpolated for queries between them.
+
+    Return their table [timestamp, device_id, recording], their poses, and the slices between losses of tracking.
+    """
+    odometry = session.odometry
+    assert odometry is not None
+    poses = odometry.world_from_device
+    has_frame = odometry.index.find(queries["timestamp"].to_numpy(), as_strings(queries["device_id"])) >= 0
+    times, ids = (queries.loc[~has_frame, name].to_numpy() for name in ("timestamp", "device_id"))
+    within, names = session.subsession_by_prefix(ids), device_names(times, ids)
+    keys = [pd.DataFrame({"timestamp": np.zeros(0, np.int64), "device_id": "", "recording": ""})]
+    joined, ends = [np.zeros((0, 4, 4))], [0]
+    for recording, rows in recordings_of(session, odometry).items():
+        own = np.flatnonzero((within == recording) | (names == recording))
+        whole = Odometry(odometry.timestamps[rows], poses[rows])
+        for part in whole.split():
+            between, interpolated = whole.part(part).at(times[own])
+            motion, order = whole.part(part).joined(times[own[between]], interpolated)
+            devices = np.append(odometry.device_ids[rows[part]], ids[own[between]])[order]
+            keys.append(pd.DataFrame({"timestamp": motion.timestamps, "device_id": devices, "recording": recording}))
+            joined.append(motion.odom_from_rig)
+            ends.append(ends[-1] + len(motion))
+    frames = pd.concat(keys, ignore_index=True)
+    parts = [slice(start, end) for start, end in pairwise(ends)]
+    return frames, Odometry(frames["timestamp"].to_numpy(), np.concatenate(joined)), parts
+
+
+def _step_rows(keys: pd.DataFrame, piece: Ints, steps: Mapping[str, Floats]) -> pd.DataFrame:
+    """Return a table with `STEP_COLUMNS`, piece by piece, of the poses (A, 4, 4) of A queries after each step."""
+    tables = list[pd.DataFrame]()
     for name, poses in steps.items():
         posed = np.isfinite(poses).all(axis=(1, 2))
-        rows = piece.query_frames[posed]
-        table = pd.DataFrame({"step": name, "timestamp": piece.motion.timestamps[rows]})
-        table["device_id"] = piece.device_ids[rows]
+        table = keys[posed].assign(step=name, piece=piece[posed])
         table[list(POSE_NAMES)] = geometry.qt_from_pose(poses[posed]).round(9)
-        yield table
+        tables.append(table)
+    return pd.concat(tables).sort_values("piece", kind="stable")[list(STEP_COLUMNS)]
 
 
-def _online_steps(piece: _Piece, settings: SequenceSettings) -> dict[str, Floats]:
-    """Return the queries' poses (A, 4, 4) from single queries of the past, by the name of the time window.
-
-    Poses found again near a predicted pose are not used, because later queries helped to predict them.
-    """
-    steps, frames = {}, piece.query_frames
-    for length_s in (*WINDOWS_S, None):
-        past = settings.model_copy(update={"online": True, "length_s": length_s})
-        name = "online" if length_s is None else f"online {length_s:g} s"
-        steps[name] = place_online(piece.motion, piece.posed, frames, past).world_from_rig[frames]
-    return steps
-
-
-def _warn_of_ground_truth(session: Session, pieces: Sequence[_Piece]) -> None:
+def _warn_of_ground_truth(session: Session, motion: Odometry, queries: PosedQueries) -> None:
     """Warn if the odometry is already in the frame of the map, where `ok` queries are: then it may be ground truth."""
-    within = list[bool]()
-    for piece in pieces:
-        sure = piece.posed.choose(piece.posed.trusted)
-        turned_deg, moved_m = pose_error(piece.motion.odom_from_rig[sure.frames], sure.world_from_rig)
-        within += ((turned_deg < 5.0) & (moved_m < 0.5)).tolist()
+    sure = queries.choose(queries.trusted)
+    turned_deg, moved_m = pose_error(motion.odom_from_rig[sure.frames], sure.world_from_rig)
+    within = (turned_deg < 5.0) & (moved_m < 0.5)
     if len(within) >= 3 and np.mean(within) > 0.5:
         log.warning(
             "%s: %d of %d `ok` queries are within 5 degrees and 0.5 m of its trajectories.txt, so this file is in the "
@@ -364,21 +289,34 @@ def _warn_of_ground_truth(session: Session, pieces: Sequence[_Piece]) -> None:
         )  # fmt: skip
 
 
-def _pieces(session: Session, singles: _SingleQueries, settings: SequenceSettings) -> Iterator[_Piece]:
-    """Yield the pieces of each recording's odometry in order of time, with frames interpolated for queries between."""
-    odometry, queries = session.odometry, singles.keys
-    assert odometry is not None
-    poses = odometry.world_from_device
-    has_frame = odometry.index.find(queries["timestamp"].to_numpy(), as_strings(queries["device_id"])) >= 0
-    times, ids = (queries.loc[~has_frame, name].to_numpy() for name in ("timestamp", "device_id"))
-    within, names = session.subsession_by_prefix(ids), device_names(times, ids)
-    for recording, rows in recordings_of(session, odometry).items():
-        own = np.flatnonzero((within == recording) | (names == recording))
-        whole = Odometry(odometry.timestamps[rows], poses[rows])
-        for part in whole.split():
-            piece, devices = whole.part(part), odometry.device_ids[rows[part]]
-            between, interpolated = piece.at(times[own])
-            piece, order = piece.joined(times[own[between]], interpolated)
-            devices = np.append(devices, ids[own[between]])[order]
-            query = singles.index.find(piece.timestamps, as_strings(devices))
-            yield _Piece(recording, devices, piece, query, singles.posed(query))
+@dataclass
+class _Relocalizer:
+    """Localizes frames again near predicted poses, in the map of the run that made the first poses."""
+
+    poses: Path
+    session: Session
+    keys: pd.DataFrame
+    """Table [timestamp, device_id] of all frames."""
+
+    @cached_property
+    def _map(self) -> Map:
+        folder, scene = self.poses.parent, self.poses.stem.rpartition("_map_")[0]
+        files = SceneFiles(folder.parent.parent, scene)
+        if files.poses_dir != folder:
+            expected = f"RUN/{scene}/poses, in a run folder whose map can be opened to localize queries again"
+            raise ArtifactError.at(folder, expected=expected, do="Write the poses there, or set relocalize: false.")
+        return Map.open(files.run, scene, pair_devices(self.poses.stem)[0])
+
+    def __call__(self, todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
+        self._map.load()
+        rows_of_each = self.session.rows_of_keyframes(self.keys.iloc[[frame for frame, _ in todo]])
+
+        def localize(number: int) -> QueryResult:
+            rows = rows_of_each[number]
+            try:
+                return self._map.locate(self._map.query_of_session(self.session, rows), near=todo[number][1])
+            except Exception as error:  # one bad query never ends a run
+                path = self.session.image_path(int(rows[0]))
+                return QueryResult.failed(reason_of(error, f"localizing {path} again"))
+
+        return list(prefetch(localize, range(len(todo)), default_workers()))

@@ -11,7 +11,7 @@ from toolkit import geometry
 from toolkit.manifest import SequenceSettings
 from toolkit.pose.base import QueryResult, RoughPose, Status
 from toolkit.sequences.odometry import PosedQueries
-from toolkit.sequences.pose_graph import STEPS, localize_piece, with_relocalized
+from toolkit.sequences.pose_graph import STEPS, localize_pieces, with_relocalized
 
 pytest.importorskip("gtsam")
 SETTINGS = SequenceSettings()
@@ -35,8 +35,8 @@ def test_what_failed_or_contradicts_is_asked_again_and_then_counts() -> None:
             assert distance_m < 4 * about.position_std
         return [answer(way, frame) for frame, _ in todo]
 
-    before = localize_piece(way.odometry, way.queries, asked, SETTINGS)
-    done = localize_piece(way.odometry, way.queries, asked, SETTINGS, relocalize)
+    before = localize_pieces(way.odometry, way.queries, asked, SETTINGS)
+    done = localize_pieces(way.odometry, way.queries, asked, SETTINGS, relocalize)
     assert seen == [*way.queries.frames[way.is_wrong], 39]
     assert list(done.relocalized) == seen
     first, second = (
@@ -78,8 +78,8 @@ def test_an_answer_that_contradicts_the_others_changes_nothing() -> None:
     way = drive(np.random.default_rng(3))
     far = QueryResult(Status.OK, "", geometry.make_pose(np.eye(3), [500.0, 0.0, 0.0]), SURE)
     asked = np.append(way.queries.frames, 39)
-    alone = localize_piece(way.odometry, way.queries, asked, SETTINGS)
-    done = localize_piece(way.odometry, way.queries, asked, SETTINGS, lambda todo: [far for _ in todo])
+    alone = localize_pieces(way.odometry, way.queries, asked, SETTINGS)
+    done = localize_pieces(way.odometry, way.queries, asked, SETTINGS, lambda todo: [far for _ in todo])
     np.testing.assert_allclose(done.placed.world_from_rig, alone.placed.world_from_rig, atol=1e-6)
     assert not done.placed.used[done.queries.frames == 39].any()
 
@@ -91,7 +91,7 @@ def test_a_piece_without_a_pose_is_not_searched_for() -> None:
     def relocalize(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
         raise AssertionError
 
-    done = localize_piece(way.odometry, nothing, np.array([3, 5]), SETTINGS, relocalize)
+    done = localize_pieces(way.odometry, nothing, np.array([3, 5]), SETTINGS, relocalize)
     assert all(status.startswith("failed") for status in done.placed.status)
     assert np.isnan(done.steps["voted"]).all()
 
@@ -107,9 +107,9 @@ def test_online_a_query_is_found_again_from_the_past_alone() -> None:
         return [answer(way, frame) for frame, _ in todo]
 
     asked = np.array([10, 25, 30])
-    done = localize_piece(way.odometry, queries, asked, settings, relocalize)
+    done = localize_pieces(way.odometry, queries, asked, settings, relocalize)
     assert sorted(rough) == [25, 30]
     later = queries.choose(queries.frames < 12)
-    localize_piece(way.odometry, later, np.array([10, 11]), settings, relocalize)
+    localize_pieces(way.odometry, later, np.array([10, 11]), settings, relocalize)
     assert geometry.pose_error(done.placed.world_from_rig[30], way.world_from_rig[30])[1] < 0.05
     assert np.isfinite(done.placed.world_from_rig[25]).all()

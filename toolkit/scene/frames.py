@@ -17,8 +17,17 @@ from toolkit.pose.base import QueryResult, RoughPose, Status, carried_over
 from toolkit.scene.images import localize_image
 from toolkit.scene.map import Map
 from toolkit.scene.query import Image
-from toolkit.sequences.odometry import Odometry, cut, with_measured_drift
-from toolkit.sequences.pose_graph import FAR, NO_QUERY, PlacedPiece, is_sure, localize_piece, queries_of
+from toolkit.sequences.odometry import Odometry
+from toolkit.sequences.pose_graph import (
+    FAR,
+    NO_QUERY,
+    PlacedPiece,
+    is_sure,
+    latest_part,
+    localize_pieces,
+    pieces_of,
+    queries_of,
+)
 from toolkit.threads import fixed_sums
 
 Images = Image | Sequence[Image] | None
@@ -101,30 +110,16 @@ def localize_sequence(
         raise ValueError(f"Found {len(cams_of_frames)} cameras and {len(images)} images: {expected}.")
     localize = partial(_localize, scene_map, rig_from_cams, turns)
     single = {frame: localize(image, cams_of_frames[frame]) for frame, image in enumerate(images) if image is not None}
-    piece, relocalized = np.zeros(len(odometry), int), dict[int, QueryResult]()
-    placed = [PlacedPiece(np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), np.zeros(0, bool), *np.zeros((2, 0), object))]
-    pieces, queries = odometry.split(), queries_of(single)
-    if not settings.online:
-        settings = with_measured_drift([(odometry.part(rows), queries.part(rows)) for rows in pieces], settings)
-        pieces = [
-            slice(rows.start + part.start, rows.start + part.stop)
-            for rows in pieces
-            for part in cut(odometry.part(rows), queries.part(rows), settings)
-        ]
-    for number, rows in enumerate(pieces):
-        piece[rows] = number
-        frames = np.array([frame for frame in single if rows.start <= frame < rows.stop], np.int64)
 
-        def relocalize(todo: Sequence[tuple[int, RoughPose]], start: int = rows.start) -> list[QueryResult]:
-            return [localize(images[start + frame], cams_of_frames[start + frame], near) for frame, near in todo]
+    def relocalize(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
+        return [localize(images[frame], cams_of_frames[frame], near) for frame, near in todo]
 
-        again = relocalize if settings.relocalize else None
-        done = localize_piece(odometry.part(rows), queries.part(rows), frames - rows.start, settings, again)
-        relocalized |= {rows.start + frame: estimate for frame, estimate in done.relocalized.items()}
-        placed.append(done.placed)
-    names = ("world_from_rig", "covariances", "status", "reason")
-    joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in placed]) for name in names}
-    return LocalizedFrames(**joined, piece=piece, single=single, relocalized=relocalized)
+    queries, asked = queries_of(single), np.array(list(single), np.int64)
+    pieces, settings = pieces_of(odometry, odometry.split(), queries, settings)
+    done = localize_pieces(odometry, queries, asked, settings, relocalize, pieces)
+    placed = done.placed
+    poses = placed.world_from_rig, placed.covariances, placed.status, placed.reason
+    return LocalizedFrames(*poses, done.piece, single, done.relocalized)
 
 
 class SequenceLocalizer:
@@ -189,23 +184,14 @@ class SequenceLocalizer:
         self._queries = self._queries.joined(queries_of({len(self._motion) - 1: self.single}))
         return self._solve(image, cams)
 
-    def _drop_before(self, start: int) -> None:
-        self._queries = self._queries.part(slice(start, len(self._motion)))
-        self._motion = self._motion.part(slice(start, None))
-
     def _solve(self, image: Images, cameras: Cameras) -> QueryResult:
-        if self.settings.length_s is not None:
-            times = self._motion.timestamps
-            self._drop_before(int(np.searchsorted(times, times[-1] - self.settings.length_s * 1e6)))
-        self._drift = with_measured_drift([(self._motion, self._queries)], self.settings)
-        self._drop_before(cut(self._motion, self._queries, self._drift)[-1].start)
+        self._motion, self._queries, self._drift = latest_part(self._motion, self._queries, self.settings)
         offline = self._drift.model_copy(update={"online": False, "length_s": None})
 
         def relocalize(todo: Sequence[tuple[int, RoughPose]]) -> list[QueryResult]:
             return [self._localize(image, cameras, near) for _, near in todo]
 
-        again = relocalize if self.settings.relocalize else None
-        done = localize_piece(self._motion, self._queries, np.array([len(self._motion) - 1]), offline, again)
+        done = localize_pieces(self._motion, self._queries, np.array([len(self._motion) - 1]), offline, relocalize)
         self._queries, placed = done.queries, done.placed
         self._solved = len(self._motion) - 1, placed
         return self._estimate(placed.world_from_rig[-1], placed.covariances[-1], placed.status[-1], placed.reason[-1])

@@ -217,6 +217,13 @@ def bounded(covariances: Floats) -> Floats:
     return limited + np.diag(least)
 
 
+def _variances(queries: PosedQueries) -> tuple[Floats, Floats]:
+    """Return mean variances (Q,) by axis of the single poses: square radians, square meters."""
+    covariances = bounded(queries.covariances)
+    rotation, position = (np.trace(covariances[:, s, s], axis1=1, axis2=2) / 3 for s in (slice(3), slice(3, 6)))
+    return rotation, position
+
+
 @dataclass(frozen=True)
 class Placement:
     """A placement of odometry in the map: single poses that agree with each other, given the odometry between them."""
@@ -313,10 +320,7 @@ class _Differences:
         expected = inverse[0][first] @ odometry.odom_from_rig[queries.frames[second]]
         difference = geometry.invert(expected) @ inverse[1][first] @ queries.world_from_rig[second]
         drift = odometry.drift(settings, queries.frames[first], queries.frames[second])
-        covariances = bounded(queries.covariances)
-        rotation, position = (
-            np.trace(covariances[:, part, part], axis1=1, axis2=2) / 3 for part in (slice(3), slice(3, 6))
-        )
+        rotation, position = _variances(queries)
         rotation_var = rotation[first] + rotation[second]
         # A wrong heading at the first query moves the second sideways, a wrong scale moves it along the path.
         length2 = (expected[:, :3, 3] ** 2).sum(axis=1)
@@ -360,10 +364,8 @@ def fitted_scale(odometry: Odometry, queries: PosedQueries, settings: SequenceSe
     if len(queries) < 2:
         return 1.0
     moved, placed = odometry.odom_from_rig[queries.frames], queries.world_from_rig
-    rotation = np.trace(bounded(queries.covariances)[:, :3, :3], axis1=1, axis2=2) / 3
-    position = np.trace(bounded(queries.covariances)[:, 3:, 3:], axis1=1, axis2=2) / 3
-    best = 0.0, 0.0
-    lag = 1
+    rotation, position = _variances(queries)
+    best, lag = (0.0, 0.0), 1
     while lag < len(queries):
         first, second = np.arange(len(queries) - lag), np.arange(lag, len(queries))
         by_odometry, by_poses = ((geometry.invert(poses[first]) @ poses[second])[:, :3, 3] for poses in (moved, placed))

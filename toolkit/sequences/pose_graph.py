@@ -58,39 +58,59 @@ class PlacedPiece:
     """(N,) `Status`; online None for frames without a query."""
     reason: NDArray[np.object_]
     """(N,) texts, empty for `ok`."""
+    voted: Floats
+    """(N, 4, 4) world_from_rig by rigid odometry, placed where most queries agree; NaN online and without a query."""
     scale: float = 1.0
-    """Scale factor of the odometry; online that of the last pose."""
+    """Scale factor of the odometry; 1 online and of several pieces."""
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    @classmethod
+    def nowhere(cls, frames: int, queries: int, status: Status | None, reason: str = "") -> "PlacedPiece":
+        """Return a piece without poses."""
+        poses, covariances = (np.full((frames, size, size), np.nan) for size in (4, 6))
+        texts = np.array([status] * frames, object), np.full(frames, reason, object)
+        return cls(poses, covariances, np.zeros(queries, bool), *texts, poses.copy())
+
+    @classmethod
+    def joined(cls, pieces: "Sequence[PlacedPiece]") -> "PlacedPiece":
+        """Return several pieces as one."""
+        names = vars(pieces[0]).keys() - {"scale"}
+        joined: dict[str, Any] = {name: np.concatenate([vars(piece)[name] for piece in pieces]) for name in names}
+        return cls(**joined) if len(pieces) > 1 else pieces[0]
 
 
 def place_online(odometry: Odometry, queries: PosedQueries, frames: Ints, settings: SequenceSettings) -> PlacedPiece:
     """Return the poses of some frames of a piece, each only from the last `settings.length_s` seconds before it."""
-    length_us = np.inf if settings.length_s is None else settings.length_s * 1e6
-    count = len(odometry)
-    piece = PlacedPiece(
-        np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan), np.zeros(len(queries), bool),
-        np.full(count, None, object), np.full(count, "", object),
-    )  # fmt: skip
+    piece = PlacedPiece.nowhere(len(odometry), len(queries), None)
     for frame in frames.tolist():
-        start = int(np.searchsorted(odometry.timestamps, odometry.timestamps[frame] - length_us))
-        within = slice(start, frame + 1)
-        past, chosen = odometry.part(within), queries.part(within)
-        drifting = with_measured_drift([(past, chosen)], settings)
-        last = cut(past, chosen, drifting)[-1]  # the part after the last loss of tracking
-        past, chosen = past.part(last), chosen.part(last)
+        until = slice(0, frame + 1)
+        past, chosen, drifting = latest_part(odometry.part(until), queries.part(until), settings)
         placed = place_piece(past, chosen, drifting)
         piece.world_from_rig[frame], piece.covariances[frame] = placed.world_from_rig[-1], placed.covariances[-1]
         piece.status[frame], piece.reason[frame] = placed.status[-1], placed.reason[-1]
         piece.used[queries.frames == frame] = placed.used[chosen.frames == len(past) - 1]
-        piece = replace(piece, scale=placed.scale)
     return piece
+
+
+def latest_part(
+    odometry: Odometry, queries: PosedQueries, settings: SequenceSettings
+) -> tuple[Odometry, PosedQueries, SequenceSettings]:
+    """Return the last `settings.length_s` seconds after the last loss of tracking, and settings of the drift there."""
+    times, length_s = odometry.timestamps, settings.length_s
+    past = slice(0 if length_s is None else int(np.searchsorted(times, times[-1] - length_s * 1e6)), len(times))
+    odometry, queries = odometry.part(past), queries.part(past)
+    settings = with_measured_drift([(odometry, queries)], settings)
+    last = cut(odometry, queries, settings)[-1]
+    return odometry.part(last), queries.part(last), settings
 
 
 def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSettings) -> PlacedPiece:
     """Return the poses of a piece of odometry, from the poses of single queries in it."""
     count = len(odometry)
     if not len(queries):
-        nothing = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan), np.zeros(0, bool)
-        return PlacedPiece(*nothing, np.array([Status.FAILED] * count, object), np.full(count, NO_QUERY, object))
+        return PlacedPiece.nowhere(count, 0, Status.FAILED, NO_QUERY)
     best = place(odometry, queries, settings)[0]
     used, seen = best.members, set[bytes]()
     for _ in range(_ROUNDS):
@@ -119,14 +139,14 @@ def place_piece(odometry: Odometry, queries: PosedQueries, settings: SequenceSet
         covariances[alone.frames] = bounded(alone.covariances)
     far = (status == Status.OK) & ~is_sure(covariances)
     status[far], reasons[far] = Status.LOW_CONFIDENCE, FAR
-    return PlacedPiece(poses, covariances, mask, status, reasons, scale)
+    voted = _median_placement(odometry, queries.choose(best.members)) @ odometry.odom_from_rig
+    return PlacedPiece(poses, covariances, mask, status, reasons, voted, scale)
 
 
 def is_sure(covariances: Floats) -> NDArray[np.bool_]:
     """Return which poses (n,) are certain enough for `ok`, from their covariances (n, 6, 6)."""
-    variances = np.diagonal(covariances, axis1=1, axis2=2)
-    turns, shifts = variances[:, :3].sum(axis=1), variances[:, 3:].sum(axis=1)
-    return np.asarray((turns <= np.deg2rad(MAX_STD_DEG) ** 2) & (shifts <= MAX_STD_M**2))
+    rotation_std_deg, position_std_m = stds_of(covariances)
+    return np.asarray((rotation_std_deg <= MAX_STD_DEG) & (position_std_m <= MAX_STD_M))
 
 
 def _chi2(poses: Floats, covariances: Floats, queries: PosedQueries) -> Floats:
@@ -185,17 +205,20 @@ def _rigid(pose: Floats) -> Floats:
 
 
 Relocalize = Callable[[Sequence[tuple[int, RoughPose]]], Sequence[QueryResult]]
-"""Function that localizes queries again: takes (frame in the piece, predicted pose) pairs, returns their estimates."""
+"""Function that localizes queries again: takes (frame, predicted pose) pairs, returns their estimates."""
 
 
 @dataclass(frozen=True)
-class LocalizedPiece:
-    """The poses of a piece of odometry, and the intermediate results."""
+class LocalizedPieces:
+    """The poses of the frames of one or more pieces of odometry, and the intermediate results."""
 
     placed: PlacedPiece
+    """All pieces joined."""
+    piece: Ints
+    """(N,) number of each frame's piece."""
     queries: PosedQueries
     """The single poses of the final graph: the first ones and those found again."""
-    relocalized: Mapping[int, QueryResult]
+    relocalized: dict[int, QueryResult]
     """Estimates of the queries that were localized again near their predicted pose, by frame."""
     steps: Mapping[str, Floats]
     """world_from_rig (A, 4, 4) of the query frames after each of `STEPS`, NaN for none."""
@@ -206,48 +229,68 @@ STEPS = ("voted", "graph", "again")
 after doubtful queries were localized again. The second pose graph gives the result."""
 
 
+def pieces_of(
+    odometry: Odometry, parts: Sequence[slice], queries: PosedQueries, settings: SequenceSettings
+) -> tuple[list[slice], SequenceSettings]:
+    """Return the pieces of a device's recordings, and settings with the drift that the queries show.
+
+    `parts` are all frames in order, without a loss of tracking that odometry itself shows. Unless `settings.online`,
+    they are cut at those that the queries show.
+    """
+    if settings.online:  # both use later frames
+        return list(parts), settings
+    of_parts = [(odometry.part(rows), queries.part(rows)) for rows in parts]
+    settings = with_measured_drift(of_parts, settings)
+    cuts = zip(parts, (cut(*of_part, settings) for of_part in of_parts), strict=True)
+    return [slice(rows.start + at.start, rows.start + at.stop) for rows, within in cuts for at in within], settings
+
+
 @fixed_sums
-def localize_piece(
+def localize_pieces(
     odometry: Odometry,
     queries: PosedQueries,
     query_frames: Ints,
     settings: SequenceSettings,
     relocalize: Relocalize | None = None,
-) -> LocalizedPiece:
-    """Return the poses of a piece of odometry: of all frames, or only of the queries if `settings.online`.
+    pieces: Sequence[slice] = (),
+) -> LocalizedPieces:
+    """Return the poses of pieces of odometry: of all frames, or only of the queries if `settings.online`.
 
     Of all `query_frames` (A,), ascending, those in `queries` have a pose. Those that are not `ok` or do not fit the
-    graph are localized by `relocalize`; None: they keep their poses. Raise ManifestError if GTSAM is not installed.
+    graph are localized by `relocalize`; None, or `settings.relocalize` is false: they keep their poses. `pieces` are
+    all frames in order; none: the odometry is one piece. Raise ManifestError if GTSAM is not installed.
     """
-    first = _placed(odometry, queries, query_frames, settings)
+    pieces = pieces or [slice(0, len(odometry))]
+
+    def placed(queries: PosedQueries, rows: slice) -> PlacedPiece:
+        of_piece = odometry.part(rows), queries.part(rows)
+        if not settings.online:
+            return place_piece(*of_piece, settings)
+        within = (query_frames >= rows.start) & (query_frames < rows.stop)
+        return place_online(*of_piece, query_frames[within] - rows.start, settings)
+
+    each = [placed(queries, rows) for rows in pieces]
+    first = PlacedPiece.joined(each)
     sure = queries.frames[first.used & queries.trusted]
     predicted = query_frames[np.isfinite(first.world_from_rig[query_frames]).all(axis=(1, 2))]
     doubtful = np.setdiff1d(predicted, sure).tolist()
     relocalized: dict[int, QueryResult] = {}
-    if relocalize is not None and doubtful:
-        stds = zip(*(each.tolist() for each in stds_of(first.covariances[doubtful])), strict=True)
+    if settings.relocalize and relocalize is not None and doubtful:
+        stds = zip(*(values.tolist() for values in stds_of(first.covariances[doubtful])), strict=True)
         rough = [RoughPose(pose, *std) for pose, std in zip(first.world_from_rig[doubtful], stds, strict=True)]
         relocalized = dict(zip(doubtful, relocalize(list(zip(doubtful, rough, strict=True))), strict=True))
     all_queries = with_relocalized(queries, relocalized)
-    second = first if all_queries is queries else _placed(odometry, all_queries, query_frames, settings)
+    for number, rows in enumerate(pieces):
+        if any(rows.start <= frame < rows.stop for frame in relocalized):
+            each[number] = placed(all_queries, rows)
     singles = np.full((len(odometry), 4, 4), np.nan)
     singles[queries.frames] = queries.world_from_rig
-    voted = np.full((len(query_frames), 4, 4), np.nan)
-    if len(queries) and not settings.online:
-        agreeing = queries.choose(place(odometry, queries, settings)[0].members)
-        voted = _median_placement(odometry, agreeing) @ odometry.odom_from_rig[query_frames]
-    graph = first.world_from_rig[query_frames]
     for frame, estimate in relocalized.items():
         if estimate.world_from_rig is not None:
             singles[frame] = estimate.world_from_rig
-    steps = dict(zip(STEPS, (voted, graph, singles[query_frames]), strict=True))
-    return LocalizedPiece(second, all_queries, relocalized, steps)
-
-
-def _placed(odometry: Odometry, queries: PosedQueries, query_frames: Ints, settings: SequenceSettings) -> PlacedPiece:
-    if settings.online:
-        return place_online(odometry, queries, query_frames, settings)
-    return place_piece(odometry, queries, settings)
+    steps = (poses[query_frames] for poses in (first.voted, first.world_from_rig, singles))
+    of_steps, piece = dict(zip(STEPS, steps, strict=True)), np.repeat(np.arange(len(pieces)), [*map(len, each)])
+    return LocalizedPieces(PlacedPiece.joined(each), piece, all_queries, relocalized, of_steps)
 
 
 def _median_placement(odometry: Odometry, agreeing: PosedQueries) -> Floats:
