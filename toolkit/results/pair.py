@@ -274,8 +274,8 @@ def find_query(query: object, images: Mapping[str, int], count: int, what: str =
     if isinstance(query, int | np.integer) and not isinstance(query, bool):
         if 0 <= query < count:
             return int(query)
-        found = f"found {query}, expected a number from 0 to {count - 1}, or the name of an image"
-        raise ArtifactError(f"{what}: {found}.")
+        known = f", expected a number from 0 to {count - 1}, or the name of an image." if count else ". There are none."
+        raise ArtifactError(f"{what}: found {query}{known}")
     if not isinstance(query, str | Path):
         raise ArtifactError(f"{what}: found {query!r}, expected a number or the name of an image.")
     name = image_name(str(query))

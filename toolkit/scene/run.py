@@ -241,11 +241,13 @@ class WorstQueries:
         """Take the queries of all pairs, or those of a device, in a folder of poses that have stored correspondences
         and can be read. The folders are as for `InspectedPair`.
         """
-        pairs: list[InspectedPair] = []
+        pairs, self._errors = list[InspectedPair](), list[ToolkitError]()
         for mapped, queried in pairs_of(poses_dir, ".h5"):
             if map_device in ("all", mapped) and query_device in ("all", queried):
-                with suppress(*OF_THE_DATA):  # an unfinished pair has no table, or a session broke after a good run
+                try:
                     pairs.append(InspectedPair(mapped, queried, poses_dir, None, map_dir, sessions_root))
+                except OF_THE_DATA as error:  # an unfinished pair has no table, or a session broke after a good run
+                    self._errors.append(error)
         queries = [(pair, number) for pair in pairs for number in range(len(pair))]
         tables = [pair.localized.localizations.errors for pair in pairs]
         order = worst_first(pd.concat(tables, ignore_index=True)).tolist() if queries else []
@@ -268,8 +270,11 @@ class WorstQueries:
         """Return a query by its rank, 0 for the worst of all, or by the name of one of its images.
 
         `worst` is the worst one with matches, as those without, such as a torn file, have little to show. A query that
-        was localized in several maps is returned where it is worst. Raise ArtifactError if there is none.
+        was localized in several maps is returned where it is worst. Raise ArtifactError if there is none, or the error
+        of the first pair if none can be read.
         """
+        if self._errors and not self._queries:
+            raise self._errors[0]
         if rank == WORST:
             tables = (pair.localized.results.table for pair, _ in self._queries)
             matched = (table.get("num_matches", table["timestamp"]).iloc[number]
@@ -459,6 +464,7 @@ class Run:
 
         Raises:
             ArtifactError: no query has this name, or several do; or its stored results are damaged.
+            ToolkitError: no pair of the run can be read: why the first one cannot.
         """
         poses = SceneFiles(self.path, self._scene(scene)).poses_dir
         return WorstQueries(poses, map_device=map_device or "all").look(name).result
