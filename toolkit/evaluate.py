@@ -30,7 +30,7 @@ from toolkit.files import (
 )
 from toolkit.geometry import Floats
 from toolkit.manifest import EvaluateSettings
-from toolkit.pose.base import Status, status_counts, statuses
+from toolkit.pose.base import Status, status_counts
 from toolkit.results import metrics
 from toolkit.results.metrics import is_posed, pose_errors
 from toolkit.results.metrics import recall as recall  # for callers
@@ -162,7 +162,8 @@ def evaluate_scene(
             if state != "evaluated":
                 messages.append(f"{name}: {state}.")
             frame = _errors_of(results, keys, truth, session, good, limits, at, unit, length)
-            errors.append(metrics.named_by_unit(frame.assign(**pair), unit))
+            as_stored = frame.assign(status=frame["status_text"]).drop(columns="status_text")
+            errors.append(metrics.named_by_unit(as_stored.assign(**pair), unit))
             rows["recall"].append({**pair, "state": state, **_summary(frame, limits, unit)})
             rows["losses"] += [{**pair, "state": state, **row} for row in _losses(frame, limits, unit)]
     if not rows["recall"]:
@@ -293,7 +294,7 @@ def _queries_with_truth(session: Session, queries: str, messages: list[str]) -> 
 
 
 def _read_results(path: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, str]:
-    """Return `keys` with the columns pose (4, 4), status and `DETAILS` (None without poses), and the pair's state."""
+    """Return the pose (4, 4), status and `DETAILS` of each query (None without poses), and the pair's state."""
     if not path.is_file():
         return None, "no poses file"
     try:
@@ -303,25 +304,21 @@ def _read_results(path: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
         return None, str(error)
     except CaptureError as error:
         return None, f"unreadable poses file ({error})"
-    located, table = is_posed(poses), path.with_suffix(".csv")
-    status = np.where(located, Status.OK, Status.FAILED).astype(object)
-    results = keys.assign(pose=list(poses), status=status, **dict.fromkeys(DETAILS, np.nan))
+    located, results, state = is_posed(poses), PairResults(path, keys), "evaluated"
     try:
-        require_whole(table, of=path)
-        if not table.is_file():  # another tool writes only poses; then every pose counts as ok
-            return results, "evaluated"
-        rows = PairResults.open(path, whole=False).table.rename(columns=POSES_UNIT)
-        details = keys.merge(rows.drop_duplicates(_KEY), how="left", on=_KEY)
+        results = PairResults.open(path).at(keys)
     except ArtifactError as error:
-        return results, f"unreadable table of queries ({error})"
-    results = results.assign(**{name: details[name].astype(float) for name in DETAILS if name in details})
-    results["status"] = details["status"].fillna(results["status"])
-    num_rows = int(details["status"].notna().sum())
-    if num_rows < len(keys):
-        return results, f"stale: {num_rows} of {len(keys)} queries have a row in {table.name}"
-    if np.any((statuses(results["status"]) == Status.FAILED).to_numpy(bool) == located):
-        return results, f"stale: {table.name} and {path.name} differ in which queries have a pose"
-    return results, "evaluated"
+        state = f"unreadable table of queries ({error})"
+    found = results.table.rename(columns=POSES_UNIT).reindex(columns=[*_KEY, "status", "status_text", *DETAILS])
+    found = found.astype({**dict.fromkeys(DETAILS, float), "status": object, "status_text": object})
+    has_row, status = found["status"].notna(), pd.Series(np.where(located, Status.OK, Status.FAILED))
+    found = found.fillna({"status": status, "status_text": status})
+    if state == "evaluated" and path.with_suffix(".csv").is_file():  # another tool writes only poses: all are ok
+        if not has_row.all():
+            state = f"stale: {has_row.sum()} of {len(keys)} queries have a row in {path.stem}.csv"
+        elif np.any((found["status"] == Status.FAILED).to_numpy(bool) == located):
+            state = f"stale: {path.stem}.csv and {path.name} differ in which queries have a pose"
+    return found.assign(pose=list(poses)), state
 
 
 def _errors_of(
@@ -369,8 +366,7 @@ def _errors_of(
 def _summary(frame: pd.DataFrame, thresholds: Sequence[metrics.Threshold], unit: str) -> dict[str, Any]:
     """Return a pair's row of the table `recall`."""
     rotation_deg, translation = (frame[name].to_numpy(float) for name in ERROR_COLUMNS[-2:])
-    status = statuses(frame["status"])
-    wrong = (status == Status.OK) & ~metrics.is_below(rotation_deg, translation, metrics.WRONG)
+    wrong = (frame["status"] == Status.OK) & ~metrics.is_below(rotation_deg, translation, metrics.WRONG)
     return {
         "queries": len(frame),
         "localized": int(np.isfinite(rotation_deg).sum()),

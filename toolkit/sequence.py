@@ -162,7 +162,7 @@ def _place_pair(
     frames = pd.read_csv(out.with_suffix(".csv"), keep_default_na=False)
     return {
         "frames": len(frames),
-        **status_counts(frames["status"]),
+        **status_counts(statuses(frames["status"])),
         "pieces": len(frames[["recording", "piece"]].drop_duplicates()),
         "queries": int((frames["turned_deg"] != "").sum()),
         "again": int((frames["again_status"] != "").sum()),
@@ -210,9 +210,9 @@ class _SingleQueries:
     def of(cls, results: PairResults) -> "_SingleQueries":
         rows = results.table.drop_duplicates(["timestamp", "device_id"], ignore_index=True)
         results = replace(results, table=rows)
-        status = rows["status"].to_numpy(object)
+        status = rows["status_text"].to_numpy(object)
         evidence = rows.reindex(columns=["p_correct", "rival_support"]).to_numpy(float)
-        ok = (statuses(rows["status"]) == Status.OK).to_numpy(bool)
+        ok = (rows["status"] == Status.OK).to_numpy(bool)
         known = np.asarray(np.isfinite(results.covariances).all(axis=(1, 2)), bool)
         covariances = np.asarray(np.where(known[:, None, None], results.covariances, UNKNOWN_COVARIANCE))
         queries = PosedQueries(np.arange(len(rows)), results.poses, covariances, vote_weights(ok, *evidence.T), ok)

@@ -32,7 +32,7 @@ from toolkit.files import (
 )
 from toolkit.geometry import Ints
 from toolkit.manifest import nearest
-from toolkit.pose.base import NetworkMatches, Query, QueryInput, QueryResult, References, Status, statuses
+from toolkit.pose.base import NetworkMatches, Query, QueryInput, QueryResult, References, Status
 from toolkit.results.localized import LocalizedPair
 from toolkit.results.metrics import is_posed, worst_first
 from toolkit.results.pair import (
@@ -250,8 +250,7 @@ class WorstQueries:
                     self._errors.append(error)
         queries = [(pair, number) for pair in pairs for number in range(len(pair))]
         tables = [pair.localized.localizations.errors for pair in pairs]
-        order = worst_first(pd.concat(tables, ignore_index=True)).tolist() if queries else []
-        self._queries = [queries[k] for k in order]
+        self._queries = [queries[k] for k in worst_first(pd.concat(tables, ignore_index=True))] if queries else []
         from toolkit.figures.query_images import shown_name
 
         self.names = [f"{pair.label}: {shown_name(pair.names[number])}" for pair, number in self._queries]
@@ -262,8 +261,8 @@ class WorstQueries:
         columns = ["map_device", "query_device", "status", "num_inliers", *errors, "image"]
         rows = []
         for pair, number in self._queries[:most]:
-            devices = dict(zip(columns, pair.localized.results.devices, strict=False))
-            rows.append({**pair.localized.localizations.errors.iloc[number].to_dict(), **devices})
+            row = pair.localized.localizations.errors.iloc[number].to_dict()
+            rows.append(row | dict(zip(columns, (*pair.localized.results.devices, row["status_text"]), strict=False)))
         return pd.DataFrame(rows).reindex(columns=columns).replace(np.inf, np.nan)
 
     def look(self, rank: int | str = 0) -> "Answer":
@@ -276,22 +275,16 @@ class WorstQueries:
         if self._errors and not self._queries:
             raise self._errors[0]
         if rank == WORST:
-            tables = (pair.localized.results.table for pair, _ in self._queries)
-            matched = (table.get("num_matches", table["timestamp"]).iloc[number]
-                       for table, (_, number) in zip(tables, self._queries, strict=True))  # fmt: skip
-            rank = next((at for at, count in enumerate(matched) if count > 0), 0)
+            rows = (pair.localized.results.table.iloc[number] for pair, number in self._queries)
+            rank = next((at for at, row in enumerate(rows) if row.get("num_matches", 1) > 0), 0)
         pair, number = self._queries[find_query(rank, self._worst_of_image, len(self._queries))]
         return pair.look(number)
 
     @cached_property
     def _worst_of_image(self) -> dict[str, int]:
         """Rank of the worst localization of each image, by its name."""
-        worst = dict[str, int]()
-        for rank, (pair, number) in enumerate(self._queries):
-            session = pair.localized.query_session
-            for row in pair.localized.rows[number].tolist():
-                worst.setdefault(session.image_name(row), rank)
-        return worst
+        ranked = reversed([(rank, pair.localized, number) for rank, (pair, number) in enumerate(self._queries)])
+        return {pair.query_session.image_name(row): rank for rank, pair, number in ranked for row in pair.rows[number]}
 
 
 # One of many queries in a notebook
@@ -402,8 +395,8 @@ class Run:
         return cls(path)
 
     def _repr_html_(self) -> str:
-        queries, keys = self.queries, ["scene", "map_device", "query_device"]
-        of_status = queries.assign(status=statuses(queries["status"])).groupby([*keys, "status"])
+        queries = self.queries
+        of_status = queries.groupby(["scene", "map_device", "query_device", "status"])
         counts = of_status.size().unstack(fill_value=0).reindex(columns=list(Status), fill_value=0)
         told = counts.to_html() if len(queries) else "<p>No queries: a map alone.</p>"
         return f"<p><b>{escape(self.path.name)}</b>: {escape(str(self.path))}</p>{told}"
@@ -441,7 +434,7 @@ class Run:
 
     @cached_property
     def queries(self) -> pd.DataFrame:
-        """One row per query and map: scene, map_device, query_device, and the columns of `poses/<pair>.csv`.
+        """One row per query and map: scene, map_device, query_device, and the columns of `PairResults.table`.
 
         Raises:
             ArtifactError: a table is damaged.
@@ -451,7 +444,7 @@ class Run:
             for devices, path in pairs_of(SceneFiles(self.path, scene).poses_dir).items():
                 tables[scene, *devices] = PairResults.open(path).table
         if not tables:
-            return pd.DataFrame(columns=[*keys, "status"])
+            return pd.DataFrame(columns=[*keys, "status", "status_text"])
         return pd.concat(tables, names=keys).reset_index(keys).reset_index(drop=True)
 
     def result(self, name: str = "worst", map_device: str | None = None, scene: str | None = None) -> QueryResult:
@@ -483,8 +476,7 @@ class Run:
             middle = session.images[["timestamp"]].assign(device_id=session.device_ids).iloc[[len(session) // 2]]
             return scene_map.query_of_session(session, session.rows_of_keyframes(middle)[0])
         of_map = queries[(queries["map_device"] == map_device) & (queries["scene"] == self._scene(scene))]
-        status = statuses(of_map["status"])
-        of_map = of_map.assign(sure=status == str(Status.OK))[status != str(Status.FAILED)]
+        of_map = of_map.assign(sure=of_map["status"] == Status.OK)[of_map["status"] != Status.FAILED]
         if not len(of_map):
             raise ArtifactError(f"{self.path}: no query was localized in the map of {map_device!r}.")
         best = of_map.sort_values(["sure", "num_inliers"], ascending=False, kind="stable")  # networks have no inliers
