@@ -233,10 +233,9 @@ def evaluate_sequences(
             pair = {"map_device": mapped, "query_device": query}
             steps.append(pd.DataFrame(sequence.recalls(keys, truth, limits, unit, length)).assign(**pair))
             changed = metrics.named_by_unit(sequence.changes(keys, truth, limits[-1], length).assign(**pair), unit)
-            single = PairResults.of(poses_dir, capture.name, mapped, query).table
+            single = PairResults.of(poses_dir, capture.name, mapped, query).at(changed[_KEY]).table
             # Results of earlier versions have no names of images.
-            images = single.reindex(columns=[*_KEY, "image"], fill_value="")
-            changes.append(changed.merge(images, "left", on=_KEY))
+            changes.append(changed.assign(image=single.reindex(columns=["image"], fill_value="")["image"]))
         except (CaptureError, ArtifactError) as error:
             logger.warning("%s: its sequences are not evaluated. %s", sequence.stem.name, error)
     tables = (pd.concat(parts, ignore_index=True) for parts in (steps, changes))
@@ -322,7 +321,7 @@ def _read_results(path: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
 
 
 def _errors_of(
-    results: pd.DataFrame,
+    frame: pd.DataFrame,
     keys: pd.DataFrame,
     truth: Trajectory | None,
     session: Session,
@@ -332,12 +331,11 @@ def _errors_of(
     unit: str,
     length: float,
 ) -> pd.DataFrame:
-    """Return a pair's rows of the table `errors`.
+    """Return a pair's rows of the table `errors`, made from what `_read_results` returns.
 
     `good`: whether each query has a good reference; None if unknown. `length`: the unit of lengths in the table.
     """
-    estimated, true = np.stack(results["pose"].to_list()), metrics.poses_of(truth, keys)  # type: ignore[arg-type]
-    frame = results.drop(columns="pose")
+    estimated, true = np.stack(frame.pop("pose").to_list()), metrics.poses_of(truth, keys)  # type: ignore[arg-type]
     rows = session.rows_of_keyframes(keys)
     frame.insert(2, "image", session.own_names(rows))
     if good is not None:
@@ -351,8 +349,7 @@ def _errors_of(
         frame["image"] = session.own_names(images[:, None])
     rotation_deg, translation = pose_errors(estimated, true)
     translation /= length
-    if "position_std_m" in frame:
-        frame["position_std_m"] /= length
+    frame["position_std_m"] /= length
     frame["rotation_error_deg"], frame["translation_error_m"] = rotation_deg, translation
     no_reference = np.zeros(len(frame), bool) if good is None else ~frame["good_reference"].to_numpy(bool)
     why_not, wrong = [metrics.NO_REFERENCE, metrics.NO_POSE], metrics.WRONG_POSE

@@ -321,8 +321,6 @@ def choose(queries: Any, chosen: int | str = 0) -> Choice:
     try:
         choice = Choice(queries.look(chosen))
     except ArtifactError as error:
-        if not str(error).startswith("query: "):
-            raise
         raise ArtifactError(f"inspect: {str(error).removeprefix('query: ')}") from None
     if TEXT_BARS in os.environ:
         display(choice.shown)
@@ -395,10 +393,9 @@ class Run:
         return cls(path)
 
     def _repr_html_(self) -> str:
-        queries = self.queries
-        of_status = queries.groupby(["scene", "map_device", "query_device", "status"])
+        of_status = self.queries.groupby(["scene", "map_device", "query_device", "status"])
         counts = of_status.size().unstack(fill_value=0).reindex(columns=list(Status), fill_value=0)
-        told = counts.to_html() if len(queries) else "<p>No queries: a map alone.</p>"
+        told = counts.to_html() if len(counts) else "<p>No queries: a map alone.</p>"
         return f"<p><b>{escape(self.path.name)}</b>: {escape(str(self.path))}</p>{told}"
 
     @cached_property
