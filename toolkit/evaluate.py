@@ -309,9 +309,9 @@ def _read_results(path: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
     except ArtifactError as error:
         state = f"unreadable table of queries ({error})"
     found = results.table.rename(columns=POSES_UNIT).reindex(columns=[*_KEY, "status", "status_text", *DETAILS])
-    found = found.astype({**dict.fromkeys(DETAILS, float), "status": object, "status_text": object})
-    has_row, status = found["status"].notna(), pd.Series(np.where(located, Status.OK, Status.FAILED))
-    found = found.fillna({"status": status, "status_text": status})
+    has_row, status = found["status_text"].notna(), np.where(located, Status.OK, Status.FAILED)
+    known = {name: found[name].where(has_row, status) for name in ("status", "status_text")}
+    found = found.astype(dict.fromkeys(DETAILS, float)).assign(**known)
     if state == "evaluated" and path.with_suffix(".csv").is_file():  # another tool writes only poses: all are ok
         if not has_row.all():
             state = f"stale: {has_row.sum()} of {len(keys)} queries have a row in {path.stem}.csv"
