@@ -23,6 +23,7 @@ from toolkit.geometry import invert
 from toolkit.manifest import LocalizeSettings
 from toolkit.pose.base import CAMERA, QueryResult, Rival, Status
 from toolkit.scene.run import (
+    WORST,
     Choice,
     InspectedPair,
     Run,
@@ -140,6 +141,8 @@ def test_the_worst_is_the_worst(small_capture: Path, tmp_path: Path) -> None:
     with pytest.raises(ArtifactError, match="to 2"):
         worst.look(3)
     assert WorstQueries(tmp_path).names == []
+    for asked in (0, WORST):  # as the notebook asks of a folder with poses of another tool, which have no matches
+        assert choose(WorstQueries(tmp_path), asked).shown is None
 
 
 def test_a_session_that_broke_after_a_run_costs_only_its_own_pairs(small_capture: Path, tmp_path: Path) -> None:

@@ -311,11 +311,11 @@ def choose(queries: Any, chosen: int | str = 0) -> Choice:
     """Show a query of `RetrievedPair`, `InspectedPair` or `WorstQueries`, and a list to choose another in its place.
 
     The figure is ordinary output, which a saved notebook keeps. There is no list when the pipeline runs the notebook.
-    `chosen` is the number or name of the first query, which must exist, unless it is a number and there are no queries.
+    `chosen` is the number or name of the first query, which must exist, unless there are no queries and it is no name.
     """
     from IPython.display import display
 
-    if not len(queries.names) and isinstance(chosen, int):
+    if not len(queries.names) and (isinstance(chosen, int) or chosen == WORST):
         print("There are no queries to show.")
         return Choice(None)
     try:
