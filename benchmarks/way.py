@@ -15,6 +15,7 @@ from pathlib import Path
 from types import CodeType, FrameType
 
 import toolkit
+from toolkit.pose.base import Query
 from toolkit.scene import Map
 
 ROOT = Path(toolkit.__file__).parent
@@ -56,6 +57,14 @@ def lines_of(path: Path, first_lines: set[int]) -> tuple[int, list[str]]:
     return len(kept), names
 
 
+def way_of(scene_map: Map, query: Query) -> dict[str, tuple[int, list[str]]]:
+    """Return the code lines and the functions that a query enters, by file of the toolkit."""
+    of_files = defaultdict[str, set[int]](set)
+    for code in entered_by(lambda: scene_map.locate(query)):
+        of_files[str(Path(code.co_filename).relative_to(ROOT))].add(code.co_firstlineno)
+    return {name: lines_of(ROOT / name, of_files[name]) for name in sorted(of_files)}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", required=True)
@@ -69,16 +78,11 @@ def main() -> None:
     first, second = (rows for rows in session.rows_of_keyframes(session.keyframes("all"))[:2])
     scene_map.locate(scene_map.query_of_session(session, first))  # opens files, loads weights
     query = scene_map.query_of_session(session, second)
-    of_files = defaultdict[str, set[int]](set)
-    for code in entered_by(lambda: scene_map.locate(query)):
-        of_files[code.co_filename].add(code.co_firstlineno)
-    total = 0
-    for name, first_lines in sorted(of_files.items()):
-        count, names = lines_of(Path(name), first_lines)
-        total += count
+    way = way_of(scene_map, query)
+    for name, (count, names) in way.items():
         listed = f": {', '.join(names)}" if arguments.lines else ""
-        print(f"{count:5}  {Path(name).relative_to(ROOT)}{listed}")
-    print(f"{total:5}  lines in {len(of_files)} files")
+        print(f"{count:5}  {name}{listed}")
+    print(f"{sum(count for count, _ in way.values()):5}  lines in {len(way)} files")
 
 
 if __name__ == "__main__":

@@ -276,7 +276,9 @@ def test_table_of_other_queries_is_named_stale(scene):
     assert result.recall["recall@(1deg,0.1m)"].item() == 0.25
     assert len(result.messages) == 1
     table = scene[1] / f"TINY_{IOS}.csv"
-    table.write_text(table.read_text() + "".join(f"{number},phone,ok\n" for number in (1, 2, 3)))
+    table.write_text(table.read_text() + "".join(f"{number},phone,\n" for number in (1, 2, 3)))
+    assert evaluate_ios(scene).recall["state"].item().startswith("stale: 1 of 4 queries")
+    table.write_text(table.read_text().replace("phone,\n", "phone,ok\n"))
     state = evaluate_ios(scene).recall["state"].item()
     assert state == f"stale: {table.name} and {table.stem}.txt differ in which queries have a pose"
 

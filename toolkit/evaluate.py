@@ -30,7 +30,7 @@ from toolkit.files import (
 )
 from toolkit.geometry import Floats
 from toolkit.manifest import EvaluateSettings
-from toolkit.pose.base import Status, status_counts, statuses
+from toolkit.pose.base import Status, status_counts
 from toolkit.results import metrics
 from toolkit.results.metrics import is_posed, pose_errors
 from toolkit.results.metrics import recall as recall  # for callers
@@ -162,7 +162,8 @@ def evaluate_scene(
             if state != "evaluated":
                 messages.append(f"{name}: {state}.")
             frame = _errors_of(results, keys, truth, session, good, limits, at, unit, length)
-            errors.append(metrics.named_by_unit(frame.assign(**pair), unit))
+            as_stored = frame.assign(status=frame["status_text"]).drop(columns="status_text")
+            errors.append(metrics.named_by_unit(as_stored.assign(**pair), unit))
             rows["recall"].append({**pair, "state": state, **_summary(frame, limits, unit)})
             rows["losses"] += [{**pair, "state": state, **row} for row in _losses(frame, limits, unit)]
     if not rows["recall"]:
@@ -232,10 +233,9 @@ def evaluate_sequences(
             pair = {"map_device": mapped, "query_device": query}
             steps.append(pd.DataFrame(sequence.recalls(keys, truth, limits, unit, length)).assign(**pair))
             changed = metrics.named_by_unit(sequence.changes(keys, truth, limits[-1], length).assign(**pair), unit)
-            single = PairResults.of(poses_dir, capture.name, mapped, query).table
+            single = PairResults.of(poses_dir, capture.name, mapped, query).at(changed[_KEY]).table
             # Results of earlier versions have no names of images.
-            images = single.reindex(columns=[*_KEY, "image"], fill_value="")
-            changes.append(changed.merge(images, "left", on=_KEY))
+            changes.append(changed.assign(image=single.reindex(columns=["image"], fill_value="")["image"]))
         except (CaptureError, ArtifactError) as error:
             logger.warning("%s: its sequences are not evaluated. %s", sequence.stem.name, error)
     tables = (pd.concat(parts, ignore_index=True) for parts in (steps, changes))
@@ -293,7 +293,7 @@ def _queries_with_truth(session: Session, queries: str, messages: list[str]) -> 
 
 
 def _read_results(path: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, str]:
-    """Return `keys` with the columns pose (4, 4), status and `DETAILS` (None without poses), and the pair's state."""
+    """Return the pose (4, 4), status and `DETAILS` of each query (None without poses), and the pair's state."""
     if not path.is_file():
         return None, "no poses file"
     try:
@@ -303,29 +303,25 @@ def _read_results(path: Path, keys: pd.DataFrame) -> tuple[pd.DataFrame | None, 
         return None, str(error)
     except CaptureError as error:
         return None, f"unreadable poses file ({error})"
-    located, table = is_posed(poses), path.with_suffix(".csv")
-    status = np.where(located, Status.OK, Status.FAILED).astype(object)
-    results = keys.assign(pose=list(poses), status=status, **dict.fromkeys(DETAILS, np.nan))
+    located, results, state = is_posed(poses), PairResults(path, keys), "evaluated"
     try:
-        require_whole(table, of=path)
-        if not table.is_file():  # another tool writes only poses; then every pose counts as ok
-            return results, "evaluated"
-        rows = PairResults.open(path, whole=False).table.rename(columns=POSES_UNIT)
-        details = keys.merge(rows.drop_duplicates(_KEY), how="left", on=_KEY)
+        results = PairResults.open(path).at(keys)
     except ArtifactError as error:
-        return results, f"unreadable table of queries ({error})"
-    results = results.assign(**{name: details[name].astype(float) for name in DETAILS if name in details})
-    results["status"] = details["status"].fillna(results["status"])
-    num_rows = int(details["status"].notna().sum())
-    if num_rows < len(keys):
-        return results, f"stale: {num_rows} of {len(keys)} queries have a row in {table.name}"
-    if np.any((statuses(results["status"]) == Status.FAILED).to_numpy(bool) == located):
-        return results, f"stale: {table.name} and {path.name} differ in which queries have a pose"
-    return results, "evaluated"
+        state = f"unreadable table of queries ({error})"
+    found = results.table.rename(columns=POSES_UNIT).reindex(columns=[*_KEY, "status", "status_text", *DETAILS])
+    has_row, status = found["status_text"].notna(), np.where(located, Status.OK, Status.FAILED)
+    known = {name: found[name].where(has_row, status) for name in ("status", "status_text")}
+    found = found.astype(dict.fromkeys(DETAILS, float)).assign(**known)
+    if state == "evaluated" and path.with_suffix(".csv").is_file():  # another tool writes only poses: all are ok
+        if not has_row.all():
+            state = f"stale: {has_row.sum()} of {len(keys)} queries have a row in {path.stem}.csv"
+        elif np.any((found["status"] == Status.FAILED).to_numpy(bool) == located):
+            state = f"stale: {path.stem}.csv and {path.name} differ in which queries have a pose"
+    return found.assign(pose=list(poses)), state
 
 
 def _errors_of(
-    results: pd.DataFrame,
+    frame: pd.DataFrame,
     keys: pd.DataFrame,
     truth: Trajectory | None,
     session: Session,
@@ -335,12 +331,11 @@ def _errors_of(
     unit: str,
     length: float,
 ) -> pd.DataFrame:
-    """Return a pair's rows of the table `errors`.
+    """Return a pair's rows of the table `errors`, made from what `_read_results` returns.
 
     `good`: whether each query has a good reference; None if unknown. `length`: the unit of lengths in the table.
     """
-    estimated, true = np.stack(results["pose"].to_list()), metrics.poses_of(truth, keys)  # type: ignore[arg-type]
-    frame = results.drop(columns="pose")
+    estimated, true = np.stack(frame.pop("pose").to_list()), metrics.poses_of(truth, keys)  # type: ignore[arg-type]
     rows = session.rows_of_keyframes(keys)
     frame.insert(2, "image", session.own_names(rows))
     if good is not None:
@@ -354,8 +349,7 @@ def _errors_of(
         frame["image"] = session.own_names(images[:, None])
     rotation_deg, translation = pose_errors(estimated, true)
     translation /= length
-    if "position_std_m" in frame:
-        frame["position_std_m"] /= length
+    frame["position_std_m"] /= length
     frame["rotation_error_deg"], frame["translation_error_m"] = rotation_deg, translation
     no_reference = np.zeros(len(frame), bool) if good is None else ~frame["good_reference"].to_numpy(bool)
     why_not, wrong = [metrics.NO_REFERENCE, metrics.NO_POSE], metrics.WRONG_POSE
@@ -369,8 +363,7 @@ def _errors_of(
 def _summary(frame: pd.DataFrame, thresholds: Sequence[metrics.Threshold], unit: str) -> dict[str, Any]:
     """Return a pair's row of the table `recall`."""
     rotation_deg, translation = (frame[name].to_numpy(float) for name in ERROR_COLUMNS[-2:])
-    status = statuses(frame["status"])
-    wrong = (status == Status.OK) & ~metrics.is_below(rotation_deg, translation, metrics.WRONG)
+    wrong = (frame["status"] == Status.OK) & ~metrics.is_below(rotation_deg, translation, metrics.WRONG)
     return {
         "queries": len(frame),
         "localized": int(np.isfinite(rotation_deg).sum()),

@@ -159,7 +159,7 @@ def _place_pair(
     frames = pd.read_csv(out.with_suffix(".csv"), keep_default_na=False)
     return {
         "frames": len(frames),
-        **status_counts(frames["status"]),
+        **status_counts(statuses(frames["status"])),
         "pieces": len(frames[["recording", "piece"]].drop_duplicates()),
         "queries": int((frames["turned_deg"] != "").sum()),
         "again": int((frames["again_status"] != "").sum()),
@@ -179,7 +179,7 @@ def _localize(
     failed with an internal error, so that the next run must try it again.
     """
     rows = single.table.drop_duplicates(["timestamp", "device_id"], ignore_index=True)
-    all_queries, status = _queries(replace(single, table=rows)), rows["status"].to_numpy(object)
+    all_queries, status = _queries(replace(single, table=rows)), rows["status_text"].to_numpy(object)
     keys, motion, parts = _recordings(session, rows)
     index = KeyIndex(rows["timestamp"].to_numpy(), as_strings(rows["device_id"]))
     query = index.find(motion.timestamps, as_strings(keys["device_id"]))  # of each frame, -1 for none
@@ -214,7 +214,7 @@ def _localize(
     frames.loc[done.queries.frames, "used"] = False
     frames.loc[done.queries.frames[placed.used], "used"] = True
     alone = np.setdiff1d(np.arange(len(rows)), query)
-    without = rows.loc[alone, ["timestamp", "device_id", "status"]].assign(single_status=status[alone])
+    without = rows.loc[alone, ["timestamp", "device_id"]].assign(status=status[alone], single_status=status[alone])
     frames = pd.concat([frames, without.astype(object)], ignore_index=True)
     poses = np.concatenate([placed.world_from_rig, all_queries.world_from_rig[alone]])
     covariances = np.concatenate([placed.covariances, all_queries.covariances[alone]])
@@ -230,7 +230,7 @@ def _localize(
 
 def _queries(single: PairResults) -> PosedQueries:
     """Return all queries, NaN for one without a pose; `frames` counts them."""
-    ok = (statuses(single.table["status"]) == Status.OK).to_numpy(bool)
+    ok = (single.table["status"] == Status.OK).to_numpy(bool)
     evidence = single.table.reindex(columns=["p_correct", "rival_support"]).to_numpy(float)
     known = np.asarray(np.isfinite(single.covariances).all(axis=(1, 2)), bool)
     covariances = np.asarray(np.where(known[:, None, None], single.covariances, UNKNOWN_COVARIANCE))

@@ -186,7 +186,7 @@ def _draw_pair(
         ), out / f"{pair.name}.png"  # fmt: skip
         chosen = np.unique(np.linspace(0, len(order) - 1, min(settings.samples, len(order))).round().astype(int))
         for number, k in enumerate((order[rank] for rank in chosen), start=1):
-            title = f"{q} query in the {m} map: {short_status(shown.errors['status'].iloc[k])}"
+            title = f"{q} query in the {m} map: {short_status(shown.errors['status_text'].iloc[k])}"
             yield draw_localization(details_of(k), title, shown.unit), out / f"localization_{pair.name}_{number}.png"
         if sequences is not None:
             sequence = draw_sequence(capture, sequences, m, q, settings.world_up, shown.unit)
@@ -213,7 +213,7 @@ def _draw_worst(path: Path, scene: str, candidates: pd.DataFrame) -> None:
     """Draw the worst queries of all pairs; `candidates` are the rows of `_draw_pair`."""
     shown = []
     for _, row in named_as_meters(candidates.iloc[worst_of_each(candidates, WORST)]).iterrows():
-        reason = [short_status(row["status"])]
+        reason = [short_status(row["status_text"])]
         if row["details"].has_matches and pd.notna(row.get("num_matches")):
             reason.append(f"{row['num_matches']:.0f} matches")
         reason += filter(None, [support_of(row)])

@@ -3,9 +3,18 @@
 import shutil
 from pathlib import Path
 
+import numpy as np
+
 from tests.test_embed import write_tiny_capture
-from toolkit.capture import Capture
-from toolkit.figures.explore import describe, draw_samples, draw_statuses, draw_top_view
+from toolkit.capture import Capture, Trajectory
+from toolkit.figures.explore import (
+    describe,
+    draw_samples,
+    draw_statuses,
+    draw_top_view,
+    list_poses,
+    list_unsure,
+)
 
 
 def test_unusable_sessions_have_a_reason_and_the_others_are_drawn(tmp_path: Path) -> None:
@@ -54,6 +63,16 @@ def test_queries_without_inliers_are_at_the_left_edge(tmp_path: Path) -> None:
     (plot,) = draw_statuses([path]).axes
     assert plot.get_xlim()[0] == 0.5 == min(x for dots in plot.collections for x, _ in dots.get_offsets())
     assert [label.get_text() for label in plot.get_yticklabels()] == ["hl in ios map"]
+
+
+def test_unsure_queries_are_listed_with_their_reasons(tmp_path: Path) -> None:
+    paths = [tmp_path / f"PLACE_map_ios_query_{device}.csv" for device in ("hl", "ios")]
+    paths[0].write_text("timestamp,device_id,status,num_inliers\n1,hl,ok,40\n2,hl,failed: too few inliers (3: no),3\n")
+    paths[1].write_text("timestamp,device_id,status,num_inliers\n1,ios,ok,40\n")
+    (row,) = list_unsure(paths).to_dict("records")
+    assert (row["pair"], row["status"], row["num_inliers"]) == ("hl in ios", "failed: too few inliers (3: no)", 3)
+    Trajectory.from_poses([1], ["hl"], np.eye(4)[None]).write(paths[0].with_suffix(".txt"))
+    assert list(list_poses(paths[0])["status"]) == ["ok", "failed: too few inliers (3: no)"]
 
 
 def test_a_session_without_poses_is_not_in_the_legend(small_capture: Path, tmp_path: Path) -> None:

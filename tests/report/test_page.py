@@ -15,6 +15,7 @@ from PIL import Image, PngImagePlugin
 from toolkit.errors import ArtifactError
 from toolkit.figures.style import SHOWN_DPI, STORED_DPI
 from toolkit.files import SceneFiles, write_sidecar
+from toolkit.pose.base import split_status
 from toolkit.report import page as report
 from toolkit.report.page import write_report
 
@@ -289,12 +290,12 @@ def test_torn_or_missing_run_is_an_error_that_says_so(tmp_path, content, named):
 
 
 def test_what_escalation_gave_and_took():
-    statuses = pd.DataFrame({
+    statuses = split_status(pd.DataFrame({
         "status": ["ok", "ok", "ok", "low_confidence", "failed: no references"],
         "first_status": [None, "low_confidence", "failed: too few matches", "low_confidence", "failed: no references"],
         "seconds": [1.0, 4.0, 5.0, 6.0, 3.0],
         "first_seconds": [None, 1.0, 1.0, 1.0, 1.0],
-    })  # fmt: skip
+    }))  # fmt: skip
     (sentence,) = report._escalation(statuses)
     assert sentence == (
         "4 queries escalated to further features, because not sure: 2 now ok, 1 with a first pose. "

@@ -13,12 +13,15 @@ from scipy.stats import binomtest
 from toolkit.files import SceneFiles
 from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings
 from toolkit.mapping.local_map import LocalMap
+from toolkit.pose.base import split_status
 from toolkit.report import review
 
 LIMIT = "recall@(1deg,0.1m)"
 PAIRS = {"map_device": ["ios", "ios"], "query_device": ["ios", "hl"]}
-QUERIES = pd.DataFrame({"map_device": "ios", "query_device": ["ios"] * 5 + ["hl"], "status": ["ok"] * 5 + ["failed: x"],
-                        "seconds": [0.1, 0.2, 0.3, 0.4, 5.0, np.nan]})  # fmt: skip
+QUERIES = split_status(pd.DataFrame({
+    "map_device": "ios", "query_device": ["ios"] * 5 + ["hl"], "status": ["ok"] * 5 + ["failed: x"],
+    "seconds": [0.1, 0.2, 0.3, 0.4, 5.0, np.nan],
+}))  # fmt: skip
 RECALL = pd.DataFrame({**PAIRS, "state": ["evaluated", "no poses file"], "queries": [5.0, 1.0], "ok": [5, np.nan],
                        LIMIT: [0.8, np.nan], "ok_wrong": [0.2, np.nan]})  # fmt: skip
 

@@ -23,8 +23,10 @@ from toolkit.geometry import invert
 from toolkit.manifest import LocalizeSettings
 from toolkit.pose.base import CAMERA, QueryResult, Rival, Status
 from toolkit.scene.run import (
+    WORST,
     Choice,
     InspectedPair,
+    Run,
     WorstQueries,
     choose,
     find_query,
@@ -139,6 +141,8 @@ def test_the_worst_is_the_worst(small_capture: Path, tmp_path: Path) -> None:
     with pytest.raises(ArtifactError, match="to 2"):
         worst.look(3)
     assert WorstQueries(tmp_path).names == []
+    for asked in (0, WORST):  # as the notebook asks of a folder with poses of another tool, which have no matches
+        assert choose(WorstQueries(tmp_path), asked).shown is None
 
 
 def test_a_session_that_broke_after_a_run_costs_only_its_own_pairs(small_capture: Path, tmp_path: Path) -> None:
@@ -149,6 +153,26 @@ def test_a_session_that_broke_after_a_run_costs_only_its_own_pairs(small_capture
     (capture / "sessions" / "hl_query" / "images.txt").write_text("a line\n")
     worst = WorstQueries(pair._h5.parent)
     assert [name.partition(":")[0] for name in worst.names] == ["ios in the map of ios"] * 2
+
+
+def test_a_run_whose_pairs_all_fail_to_open_says_why(small_capture: Path, tmp_path: Path) -> None:
+    """It said "found 0, expected a number from 0 to -1"."""
+    import h5py
+
+    poses = written(small_capture, tmp_path, [stored()])._h5.parent
+    written(small_capture, tmp_path, [stored()], device="hl")
+    (tmp_path / "run.json").write_text("{}")
+    for path in poses.glob("*.h5"):
+        with h5py.File(path, "a") as file:
+            file.attrs["settings"] = json.dumps({"removed": 1})
+    for query in ("worst", "0.jpg"):
+        with pytest.raises(ArtifactError, match=r"_query_hl\.h5: another version.*Run its stage again"):
+            Run.open(tmp_path).result(query)
+    assert WorstQueries(poses).names == []
+    for path in poses.glob("*.h5"):
+        path.unlink()
+    with pytest.raises(ArtifactError, match="There are none"):
+        Run.open(tmp_path).result()
 
 
 def test_a_failed_query_says_why_and_is_drawn(small_capture: Path, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from toolkit.files import SceneFiles, file_fingerprint
 from toolkit.geometry import pose_error
 from toolkit.localize import localize_image, localize_pairs
 from toolkit.manifest import load_manifest
+from toolkit.pose.base import split_status
 from toolkit.results.pair import PairResults
 from toolkit.retrieve import retrieve_pairs
 from toolkit.scene import Run
@@ -34,7 +35,7 @@ def test_a_run_has_its_settings_maps_and_queries(small_run: Path, released_weigh
     (device, *_) = queries["map_device"]
     assert run.map(device).device == device
     of_device = queries[queries["map_device"] == device]
-    assert set(of_device["status"]) == set(
+    assert set(of_device["status_text"]) == set(
         pd.concat([table for stem, table in tables.items() if f"_map_{device}_query_" in stem])["status"]
     )
     row = of_device.iloc[-1]
@@ -42,7 +43,7 @@ def test_a_run_has_its_settings_maps_and_queries(small_run: Path, released_weigh
     query = run[name]
     folder = run.map(device).capture[f"{row['query_device']}_query"].path / "raw_data"
     assert {view.image for view in query.views} == {folder / image for image in (name, *others)}
-    assert run.map(device).locate(query).status == row["status"].partition(":")[0]
+    assert run.map(device).locate(query).status == row["status"]
     with pytest.raises(ArtifactError, match=r"no query has an image 'nowhere.jpg'"):
         run["nowhere.jpg"]
 
@@ -111,7 +112,8 @@ def test_a_map_by_itself_localizes_as_a_run_with_queries(small_capture: Path, tm
 def test_the_best_query_has_a_pose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Poses by networks have no inliers; the first row was taken, whatever its status."""
     rows = [("a.jpg", "failed: undecided", 0), ("b.jpg", "low_confidence: rivals", 0), ("c.jpg", "ok", 0)]
-    table = pd.DataFrame(rows, columns=["image", "status", "num_inliers"]).assign(map_device="ios", scene="PLACE")
+    table = split_status(pd.DataFrame(rows, columns=["image", "status", "num_inliers"]))
+    table = table.assign(map_device="ios", scene="PLACE")
     monkeypatch.setattr(Run, "queries", table)
     monkeypatch.setattr(Run, "scenes", ["PLACE"])
     monkeypatch.setattr(Run, "__getitem__", lambda _, name: name)

@@ -16,6 +16,7 @@ from toolkit.capture import Capture, Trajectory, write_depth, write_session
 from toolkit.errors import ArtifactError, CaptureError
 from toolkit.geometry import make_pose, quaternion_to_rotation
 from toolkit.mapping.local_map import LocalMap
+from toolkit.pose.base import split_status
 from toolkit.results.localized import Localizations, QueryDetails, ShownImage
 from toolkit.viewer.queries import record_localizations, scene_view, shown_intrinsics, small_jpeg, spawn_viewer
 from toolkit.viewer.sessions import record_session, session_tracks
@@ -287,7 +288,8 @@ def test_a_localization_view_holds_the_queries(capture, tmp_path, monkeypatch):
     references = np.full((4, 3), np.nan)
     references[2] = [7, 8, 9]
     errors = {"rotation_error_deg": [0, 0, np.inf, np.nan], "translation_error_m": [0, 0.5, np.inf, np.nan]}
-    table = pd.DataFrame({"status": ["ok", "ok", "failed: dark", "ok"], "num_inliers": [9, 8, 0, 7], **errors})
+    columns = {"status": ["ok", "ok", "failed: dark", "ok"], "num_inliers": [9, 8, 0, 7]}
+    table = split_status(pd.DataFrame({**columns, **errors}))
     queries = Localizations(list("abcd"), table, estimated, true, references)
     points = rng.uniform([-0.3, -0.3, 2], [0.3, 0.3, 4], (6, 3))
     pixels = rng.uniform(0, 90, (6, 2))
@@ -344,7 +346,7 @@ def test_a_world_far_from_its_origin_is_shown_without_jitter(small_capture: Path
     correspondences = np.ones((2, 2)), poses[:2, :3, 3], np.arange(2), np.ones(2, bool)
     shown = ShownImage("b.jpg", file, camera, poses[1], *correspondences)
     errors = {"rotation_error_deg": [1, np.inf], "translation_error_m": [0.2, np.inf]}
-    table = pd.DataFrame({"status": ["ok", "failed: dark"], "num_inliers": [9, 0], **errors})
+    table = split_status(pd.DataFrame({"status": ["ok", "failed: dark"], "num_inliers": [9, 0], **errors}))
     estimated = np.stack([poses[1], np.full((4, 4), np.nan)])
     queries = Localizations(["a", "b"], table, estimated, poses[:2], poses[:2, :3, 3])
     views = []

@@ -53,7 +53,7 @@ from toolkit.files import (
 from toolkit.geometry import Floats, invert, qt_from_pose
 from toolkit.manifest import require_known
 from toolkit.mapping.local_map import LocalMap, map_path
-from toolkit.pose.base import Status, statuses
+from toolkit.pose.base import Status
 from toolkit.results.pair import PairResults, localized_scenes, map_inputs, names_of_maps, pairs_of
 from toolkit.runs.folder import open_captures
 from toolkit.store.hdf5 import HDF5_ERRORS, group_names_of, has_group, read_group, write_groups
@@ -456,7 +456,8 @@ def _opened(path: Path) -> h5py.File:
 
 def geo_table(run: str | Path, capture: str | Path | None = None) -> pd.DataFrame:
     """Return a row per query image of a run and map with an origin: `KEYS`, `georeference.GEO_COLUMNS`, `num_inliers`,
-    `position_std_m` with that of the map's place, and `path`, the file. The pose's columns are NaN without a pose.
+    `position_std_m` with that of the map's place, `path`, the file, and `sure`, whether the status is `ok`. The pose's
+    columns are NaN without a pose.
 
     Raise CaptureError if no map has an origin; ArtifactError if there are no poses, or only outdated ones.
     """
@@ -482,18 +483,18 @@ def geo_table(run: str | Path, capture: str | Path | None = None) -> pd.DataFram
 
 
 def _table_of(results: PairResults, session: Any, origin: Floats, scene: str) -> pd.DataFrame:
-    numbers, rows = [], []
-    for number, of_query in enumerate(session.rows_of_keyframes(results.table)):
-        numbers += [number] * len(of_query)
-        rows += of_query.tolist()
+    of_query = session.rows_of_keyframes(results.table)
+    numbers = np.repeat(np.arange(len(results)), [*map(len, of_query)])
+    rows = [int(row) for images in of_query for row in images]
     table = results.table.iloc[numbers].reset_index(drop=True)
     world_from_cams = results.poses[numbers] @ session.rig_from_cam(rows)
     table = table.assign(
+        sure=table["status"] == Status.OK, status=table["status_text"],
         scene=scene, map_device=results.devices[0], query_device=results.devices[1],
         image=[session.image_name(row) for row in rows], path=[session.image_path(row) for row in rows],
     )  # fmt: skip
     table[list(GEO_COLUMNS)] = geographic_poses(world_from_cams, origin)
-    return table.reindex(columns=[*KEYS, *GEO_COLUMNS, "num_inliers", "position_std_m", "path"])
+    return table.reindex(columns=[*KEYS, *GEO_COLUMNS, "num_inliers", "position_std_m", "path", "sure"])
 
 
 def export_geo(run: str | Path, out: str | Path, capture: str | Path | None = None) -> int:
@@ -505,7 +506,8 @@ def export_geo(run: str | Path, out: str | Path, capture: str | Path | None = No
     out = Path(out)
     if out.suffix.lower() not in FORMATS:
         raise ManifestError(f"{out}: found the ending {out.suffix!r}, expected {' or '.join(FORMATS)}.")
-    table = geo_table(run, capture).drop(columns="path").assign(image=lambda rows: rows["image"].map(own_name))
+    table = geo_table(run, capture).drop(columns=["path", "sure"])
+    table["image"] = table["image"].map(own_name)
     if out.suffix.lower() == ".csv":
         write_csv(out, table)
         return int(table["latitude_deg"].notna().sum())
@@ -532,7 +534,6 @@ def export_exif(
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ManifestError(f"{out}: contains files already. Give an empty or new folder.")
     table = geo_table(run, capture)
-    table = table.assign(sure=statuses(table["status"]) == str(Status.OK))
     table = table[table["latitude_deg"].notna() & (table["sure"] | unsure)]
     best_first = ["sure", "num_inliers", "position_std_m"]
     table = table.sort_values(best_first, ascending=[False, False, True], kind="stable")

@@ -22,7 +22,7 @@ from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.files import RAW_DATA, SceneFiles, pair_name, read_references, require_current, write_atomic, write_csv
 from toolkit.geometry import invert, unit
 from toolkit.manifest import require_known
-from toolkit.pose.base import Status, statuses
+from toolkit.pose.base import Status
 from toolkit.results.pair import PairResults
 from toolkit.runs.folder import open_captures
 
@@ -133,16 +133,16 @@ def _answers(
     files: SceneFiles, pair: tuple[str, ...], path: Path, keyframes: pd.DataFrame, failed: str
 ) -> tuple[Trajectory, pd.DataFrame, int]:
     """Return the poses to write for the keyframes, their origins, and the number of poses that nobody asked for."""
-    key, lines = ["timestamp", "device_id"], read_table(path, COLUMNS["trajectories.txt"])
-    poses, repeated = Trajectory.from_table(lines), lines.frame(*key).duplicated().to_numpy()
+    results = PairResults.open(path, whole=False)
+    poses, table = results.trajectory, results.at(keyframes).table.fillna({"status_text": "no row in the run's table"})
+    repeated = poses.index.find(poses.timestamps, poses.device_ids) < np.arange(len(poses))  # it finds the first one
     is_wrong = repeated | (np.abs(np.linalg.norm(poses.qt[:, :4], axis=1) - 1) > UNIT_TOLERANCE)
     for row in np.flatnonzero(is_wrong)[:1].tolist():
         found = f"{poses.timestamps[row]}, device {poses.device_ids[row]!r}"
         found += " twice" if repeated[row] else " with a quaternion that is not of length 1"
-        raise ArtifactError.at(lines.where(row), found, do="Localize this pair again, or correct the line.")
-    results = PairResults.open(path, whole=False).table.drop_duplicates(key, keep="last")
-    table = keyframes.merge(results[[*key, "status"]], "left", key)
-    status, times, devices = table.pop("status").fillna("no row in the run's table"), table[key[0]], table[key[1]]
+        where = read_table(path, COLUMNS["trajectories.txt"]).where(row)
+        raise ArtifactError.at(where, found, do="Localize this pair again, or correct the line.")
+    status, times, devices = (table[name] for name in ("status_text", "timestamp", "device_id"))
     rows, own, why_not = poses.index.find(times.to_numpy(np.int64), devices), len(poses), "not localized"
     is_own = rows >= 0
     if failed == "nearest" and not is_own.all():
@@ -150,8 +150,8 @@ def _answers(
         nearest, why_not = _nearest_references(files.retrieval(*pair))
         ids = [*poses.device_ids, *nearest.device_ids]
         poses = Trajectory([*poses.timestamps, *nearest.timestamps], ids, np.vstack([poses.qt, nearest.qt]))
-        rows = poses.index.find(times.to_numpy(np.int64), devices)  # the first one, so nearest come last
-    is_posed, is_low = rows >= 0, statuses(status) == Status.LOW_CONFIDENCE
+        rows = poses.index.find(times.to_numpy(np.int64), devices)  # so nearest come last
+    is_posed, is_low = rows >= 0, table["status"] == Status.LOW_CONFIDENCE
     table["pose"] = np.select([is_own & is_low, is_own, is_posed], ["low_confidence", "ok", "nearest"], "left out")
     table["reason"] = np.where(is_own, "", status + np.where(is_posed, "", f"; {why_not}"))
     qt = poses.qt[rows[is_posed]]

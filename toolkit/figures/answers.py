@@ -216,7 +216,7 @@ class Comparison:
     def figure(self) -> "Figure":
         """Both answers side by side."""
         changed = ", ".join(f"{key}: {value}" for key, value in self.changes.items()) or "no setting changed"
-        first = self.before.headline.rpartition(":")[0]
+        first = f"{self.before.of} in the map of {self.before.map_session.device}"
         return draw_answers([self.before, self.after], f"{first}, localized again\n{textwrap.fill(changed, 120)}")
 
     def __repr__(self) -> str:

@@ -18,7 +18,7 @@ from toolkit.figures.style import GREEN, ORANGE, VERMILLION, new_figure, plain_l
 from toolkit.figures.top_view import Ground, Layer, draw_places
 from toolkit.files import image_name, pair_devices, read_references
 from toolkit.geometry import Floats, qt_from_pose
-from toolkit.pose.base import Status, short_status, statuses
+from toolkit.pose.base import Status, short_status
 from toolkit.results.metrics import is_posed
 from toolkit.results.pair import PairResults
 from toolkit.sequences.odometry import Odometry, recordings_of
@@ -76,7 +76,7 @@ def list_poses(path: str | Path) -> pd.DataFrame:
     table, poses = results.table, results.poses
     rows = np.full((len(table), len(POSE_NAMES)), np.nan)
     rows[is_posed(poses)] = qt_from_pose(poses[is_posed(poses)])
-    shown = table.reindex(columns=["image"]).assign(status=table["status"].map(short_status))
+    shown = table.reindex(columns=["image"]).assign(status=table["status_text"].map(short_status))
     return shown.join(pd.DataFrame(rows, columns=POSE_NAMES))
 
 
@@ -85,8 +85,8 @@ def list_unsure(paths: Iterable[str | Path]) -> pd.DataFrame:
     tables = []
     for results in map(PairResults.open, paths):
         (mapped, queried), table = results.devices, results.table
-        unsure = table[statuses(table["status"]) != Status.OK].reindex(columns=["image", "status", "num_inliers"])
-        tables.append(unsure.assign(pair=f"{queried} in {mapped}"))
+        unsure = table.assign(status=table["status_text"])[table["status"] != Status.OK]
+        tables.append(unsure.reindex(columns=["image", "status", "num_inliers"]).assign(pair=f"{queried} in {mapped}"))
     columns = ["pair", "status", "num_inliers", "image"]
     return pd.concat(tables, ignore_index=True)[columns] if tables else pd.DataFrame(columns=columns)
 
@@ -213,7 +213,7 @@ def draw_statuses(paths: Iterable[str | Path]) -> "Figure":
     figure = new_figure(8, 0.35 * len(tables) + 1.2)
     plot = figure.subplots()
     for status, color in {"ok": GREEN, "low_confidence": ORANGE, "failed": VERMILLION}.items():
-        rows = [table[statuses(table["status"]) == status] for table in tables.values()]
+        rows = [table[table["status"] == status] for table in tables.values()]
         inliers = np.concatenate([row["num_inliers"].fillna(0).to_numpy(float) for row in rows])
         heights = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
         label = f"{status.replace('_', ' ')}: {len(inliers)}"

@@ -128,8 +128,13 @@ class Status(StrEnum):
 
 
 def statuses(texts: pd.Series) -> pd.Series:
-    """Return the column `status` of a table without the reasons: `ok`, `low_confidence`, `failed`."""
+    """Return the column `status` of a file without the reasons: values of `Status`."""
     return texts.astype(object).fillna("").astype(str).str.split(":", n=1).str[0]
+
+
+def split_status(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the table of a file: `status` is the value of `Status` alone, `status_text` is what the file says."""
+    return table.assign(status=statuses(table["status"]), status_text=table["status"])
 
 
 def short_status(text: str) -> str:
@@ -138,10 +143,9 @@ def short_status(text: str) -> str:
     return textwrap.shorten(text, MAX_STATUS, placeholder=" …")
 
 
-def status_counts(texts: pd.Series) -> dict[str, int]:
+def status_counts(statuses: pd.Series) -> dict[str, int]:
     """Return how many rows of a table have each status."""
-    counts = statuses(texts).value_counts()
-    return {str(status): int(counts.get(status, 0)) for status in Status}
+    return {str(status): int((statuses == status).sum()) for status in Status}
 
 
 class Rival(NamedTuple):
@@ -351,14 +355,14 @@ class QueryResult:
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any], arrays: Mapping[str, Any] | None = None) -> Self:
-        """Return the result that `to_row` made a row from, which may lack columns or values, and `arrays` its arrays;
-        None: without a pose, names and correspondences.
+        """Return the result of a row of `to_row` or `PairResults.table`, which may lack columns or values, and of its
+        `arrays`; None: without a pose, names and correspondences.
 
         Raises:
             ValueError, KeyError: an array has another shape or is missing.
         """
         known = {name: value for name, value in row.items() if not pd.isna(value)}
-        status, reason = Status.parse(str(known["status"]))
+        status, reason = Status.parse(str(known.get("status_text", known["status"])))
         kinds = {name: type(getattr(cls, name)) for name in _NUMBERS if name not in _FROM_OTHERS}
         return cls(
             status,

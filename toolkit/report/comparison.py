@@ -403,12 +403,9 @@ def _draw_query(comparison: Comparison, query: Mapping[str, Any], run: str) -> "
         attributes = how_localized(files.poses_csv(*devices).with_suffix(".h5"))[1]
         capture = Capture.from_sessions_root(attributes[SESSIONS_ROOT])
         pair = LocalizedPair.open(capture, *devices, files.poses_dir, files.maps)
-        table = pair.results.table
-        rows = np.flatnonzero((table["timestamp"] == query["timestamp"]) & (table["device_id"] == query["device_id"]))
-        if not len(rows):
-            raise ArtifactError(f"{files.poses_dir / pair.name}.csv: no row of query {query['timestamp']}.")
-        title = f"{run}: {table['status'].iloc[rows[0]]}"
-        figure = draw_localization(pair.details(int(rows[0])), title=title, unit=pair.results.unit)
+        number = pair.results.number((query["timestamp"], query["device_id"]))
+        title = f"{run}: {pair.results.table['status_text'].iloc[number]}"
+        figure = draw_localization(pair.details(number), title=title, unit=pair.results.unit)
         figure.set_label(f"query {query['timestamp']}, {title}")
         return title, figure
 

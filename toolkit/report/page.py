@@ -29,7 +29,7 @@ from toolkit.files import (
     write_sidecar,
     write_text,
 )
-from toolkit.pose.base import Status, short_status, status_counts, statuses
+from toolkit.pose.base import Status, short_status, split_status, status_counts, statuses
 from toolkit.report import review
 from toolkit.report.review import Interval
 from toolkit.results import metrics
@@ -56,8 +56,8 @@ LINKED = {
     "References, a line for each image": "retrieval/*.jsonl",
 }
 STATUS_COLUMNS = [
-    "timestamp", "device_id", "image", "reason", "status", "num_inliers", "position_std_m", "seconds",
-    "first_status", "first_seconds",
+    "timestamp", "device_id", "image", "reason", "status", "status_text", "num_inliers", "position_std_m",
+    "seconds", "first_status", "first_seconds",
 ]  # fmt: skip
 # Figures that say more than the page's tables: a heading, and how to read each.
 EVALUATION_FIGURES = {
@@ -279,7 +279,8 @@ def _scene(files: SceneFiles, run: Mapping[str, Any], album: "Album") -> dict[st
 def _read_table(path: Path, messages: list[str]) -> pd.DataFrame:
     """Read a table; empty if the file is missing. An unreadable file adds a line to `messages`."""
     try:
-        return metrics.named_as_meters(pd.read_csv(path, dtype={"device_id": str}).rename(columns=POSES_UNIT))
+        table = metrics.named_as_meters(pd.read_csv(path, dtype={"device_id": str}).rename(columns=POSES_UNIT))
+        return split_status(table) if "status" in table else table
     except (FileNotFoundError, pd.errors.EmptyDataError):
         pass
     except (OSError, ValueError) as error:
@@ -292,12 +293,10 @@ def _read_statuses(files: SceneFiles, messages: list[str]) -> pd.DataFrame:
     tables = [pd.DataFrame()]
     for devices, path in pairs_of(files.poses_dir).items():
         try:
-            table = PairResults.open(path).table
+            table = PairResults.open(path).table.rename(columns=POSES_UNIT).reindex(columns=STATUS_COLUMNS)
+            tables.append(table.assign(**dict(zip(review.PAIR, devices, strict=True))))
         except ArtifactError:
             messages.append(f"{path.name} cannot be read")
-            continue
-        of_pair = dict(zip(review.PAIR, devices, strict=True))
-        tables.append(table.rename(columns=POSES_UNIT).reindex(columns=STATUS_COLUMNS).assign(**of_pair))
     return pd.concat(tables, ignore_index=True)
 
 
@@ -339,7 +338,7 @@ def _escalation(queries: pd.DataFrame) -> list[str]:
     escalated = queries[queries["first_status"].notna()]
     if not len(escalated):
         return []
-    before, after = (statuses(escalated[name]) for name in ("first_status", "status"))
+    before, after = statuses(escalated["first_status"]), escalated["status"]
     posed = ((before == Status.FAILED) & (after != Status.FAILED)).sum()
     seconds = (escalated["seconds"] - escalated["first_seconds"]).sum()
     gained = f", {posed} with a first pose" if posed else ""
@@ -465,11 +464,11 @@ def _losses(losses: pd.DataFrame) -> Markup:
 
 
 def _failures(queries: pd.DataFrame) -> Markup:
-    failed = queries[statuses(queries["status"]) == Status.FAILED] if len(queries) else queries
+    failed = queries[queries["status"] == Status.FAILED] if len(queries) else queries
     if not len(failed):
         return Markup()
     # Drop details in parentheses: they differ from query to query for the same reason.
-    reasons = failed["status"].map(lambda text: re.sub(r" \(.*", "", Status.parse(text)[1]))
+    reasons = failed["status_text"].map(lambda text: re.sub(r" \(.*", "", Status.parse(text)[1]))
     groups = _queries(failed).groupby(reasons.rename("reason"))
     where = groups.agg(lambda pairs: ", ".join(f"{pair} {count}" for pair, count in pairs.value_counts().items()))
     table = pd.DataFrame({"queries": groups.size(), "where": where})
@@ -482,7 +481,7 @@ def _failures(queries: pd.DataFrame) -> Markup:
 def _wrong_ok(errors: pd.DataFrame, unit: str) -> Markup:
     if not len(errors):
         return Markup()
-    called_ok = errors[statuses(errors["status"]) == Status.OK]
+    called_ok = errors[errors["status"] == Status.OK]
     turned, moved = called_ok[["rotation_error_deg", "translation_error_m"]].to_numpy(float).T
     wrong = called_ok[~metrics.is_below(turned, moved, metrics.WRONG)]
     wrong = wrong.sort_values("translation_error_m", ascending=False)
@@ -516,7 +515,7 @@ def _listed(queries: pd.DataFrame, caption: str, unit: str) -> Markup:
         rows, names = queries.to_dict("records"), {}
         table["off by"] = [off_by(row, unit=unit) for row in rows]
         table["why"] = [_why(row) for row in rows]
-    table["status"] = queries["status"].map(short_status).str.replace("low_confidence", "low confidence")
+    table["status"] = queries["status_text"].map(short_status).str.replace("low_confidence", "low confidence")
     table["inliers"] = queries["num_inliers"]
     names |= {"p_correct": "stated to be right", "rival_support": "support of a rival"}
     known = queries.filter([*names]).dropna(axis="columns", how="all").rename(columns=names)

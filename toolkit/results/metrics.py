@@ -13,7 +13,7 @@ from toolkit.capture.images import in_view, view_bounds
 from toolkit.files import image_name
 from toolkit.geometry import Floats, Ints, invert, pose_error, transform
 from toolkit.manifest import PnpSettings
-from toolkit.pose.base import Status, statuses
+from toolkit.pose.base import Status
 from toolkit.runs.folder import counted
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ def worst_first(queries: pd.DataFrame, threshold: Threshold = THRESHOLDS[0]) -> 
         values = np.asarray(values, np.float64)
         return np.where(np.isnan(values), unknown, values)
 
-    status = statuses(queries["status"])
+    status = queries["status"]
     ok, sure = (status != Status.FAILED).to_numpy(bool), (status != Status.LOW_CONFIDENCE).to_numpy(bool)
     rotation, translation = column("rotation_error_deg", -1) / threshold[0], column("translation_error_m", -1)
     error = np.maximum(rotation, translation / threshold[1])
@@ -195,22 +195,22 @@ def camera_messages(session: "Session", tables: Sequence[pd.DataFrame]) -> list[
 
     Args:
         session: session of the queries.
-        tables: `poses/<pair>.csv` of pairs with these queries: timestamp, device_id, status, p_correct, focal_px and
-            principal_point_px.
+        tables: `poses/<pair>.csv` of pairs with these queries: timestamp, device_id, status, status_text, p_correct,
+            focal_px and principal_point_px.
     """
     posed, sensors, columns = Counter[str](), session.images["sensor_id"].to_numpy(), ("focal_px", "principal_point_px")
     fitted: dict[tuple[str, str], list[tuple[list[float], int, bool]]] = {}
     for table in tables:
         sure = table.reindex(columns=["p_correct"])["p_correct"].to_numpy(float) >= PnpSettings().ok_probability
-        rows = table.reindex(columns=["status", *columns]).astype(object)
+        rows = table.reindex(columns=["status", "status_text", *columns]).astype(object)
         texts = rows.where(rows.notna(), "").astype(str).to_dict("records")
         for images, row, certain in zip(session.rows_of_keyframes(table), texts, sure, strict=True):
-            status, reason = Status.parse(row["status"] or Status.FAILED)
-            if status is Status.FAILED:
+            if row["status"] in ("", Status.FAILED):
                 continue
+            in_doubt = row["status"] == Status.LOW_CONFIDENCE and row["status_text"] != row["status"]  # for a reason
             names = [re.sub(r"[_-]\d{6,}$", "", sensor_id) for sensor_id in sensors[images]]
             posed.update(names)
-            for column in columns if status is Status.LOW_CONFIDENCE and reason else ():
+            for column in columns if in_doubt else ():
                 for name, image, value in zip(names, images, row[column].split(";"), strict=False):
                     if value:
                         fit = [float(x) for x in value.split()], int(image), bool(certain)

@@ -41,7 +41,7 @@ from toolkit.files import (
 from toolkit.geometry import Floats
 from toolkit.manifest import LocalizeSettings, Settings, nearest
 from toolkit.mapping.local_map import LocalMap, map_path
-from toolkit.pose.base import QueryResult, Status
+from toolkit.pose.base import QueryResult, Status, split_status
 from toolkit.results.metrics import is_posed, length_unit, named_by_unit, pose_errors
 from toolkit.runs.folder import RECORD
 from toolkit.store.hdf5 import HDF5_ERRORS, has_group, read_group
@@ -69,7 +69,8 @@ class PairResults:
     path: Path
     """`poses/<pair>.txt`."""
     table: pd.DataFrame
-    """`poses/<pair>.csv`: one row per query, `status` as text. Lengths are in the unit of the poses."""
+    """`poses/<pair>.csv`: one row per query. `status` is the value of `Status`; the file's text, with the reason, is
+    `status_text`. Lengths are in the unit of the poses."""
 
     @classmethod
     def open(cls, path: str | Path, whole: bool = True) -> "PairResults":
@@ -89,18 +90,23 @@ class PairResults:
             require_whole(poses)
             require_whole(csv, of=poses)
         if csv.is_file() or not poses.is_file():
-            return cls(poses, read_query_table(csv, ["status"]))
+            return cls(poses, split_status(read_query_table(csv, ["status"])))
         try:
             read = Trajectory.read(poses)
         except CaptureError as error:
             raise ArtifactError(str(error)) from None
         keys = {"timestamp": read.timestamps, "device_id": np.asarray(read.device_ids, object)}
-        return cls(poses, pd.DataFrame({**keys, "status": str(Status.OK)}))
+        return cls(poses, split_status(pd.DataFrame({**keys, "status": str(Status.OK)})))
 
     @classmethod
     def of(cls, poses_dir: str | Path, scene: str, map_device: str, query_device: str) -> "PairResults":
         """Open the results of a pair in a folder of poses; see `open`."""
         return cls.open(Path(poses_dir) / f"{pair_name(scene, map_device, query_device)}.txt")
+
+    def at(self, keys: pd.DataFrame) -> "PairResults":
+        """Return the results of queries, a table with `timestamp` and `device_id`; NaN for one without a row."""
+        key = ["timestamp", "device_id"]
+        return replace(self, table=keys.merge(self.table.drop_duplicates(key), "left", key))
 
     @property
     def devices(self) -> tuple[str, str]:
@@ -131,8 +137,7 @@ class PairResults:
 
     @cached_property
     def _keys(self) -> dict[tuple[int, str], int]:
-        keys = zip(self.table["timestamp"], self.table["device_id"], strict=True)
-        return {key: number for number, key in enumerate(keys)}
+        return {key: n for n, key in enumerate(zip(self.table["timestamp"], self.table["device_id"], strict=True))}
 
     @cached_property
     def _images(self) -> dict[str, int]:
@@ -165,6 +170,13 @@ class PairResults:
     def __iter__(self) -> Iterator[QueryResult]:
         return (self[number] for number in range(len(self)))
 
+    def number(self, query: int | str | tuple[int, str]) -> int:
+        """Return the number of a query in the table; see `__getitem__`."""
+        number = self._keys.get(query) if isinstance(query, tuple) else find_query(query, self._images, len(self))
+        if number is None:
+            raise ArtifactError(f"{self.path}: no query {query}.")
+        return number
+
     def __getitem__(self, query: int | str | tuple[int, str]) -> QueryResult:
         """Return the result of a query by its number in the table, its (timestamp, device id), or the name of one of
         its images, or a unique end of that.
@@ -172,9 +184,7 @@ class PairResults:
         Raises:
             ArtifactError: there is no such query, or its correspondences are damaged (DamagedError) or cannot be read.
         """
-        number = self._keys.get(query) if isinstance(query, tuple) else find_query(query, self._images, len(self))
-        if number is None:
-            raise ArtifactError(f"{self.path}: no query {query}.")
+        number = self.number(query)
         pose, covariance = self.poses[number], self.covariances[number]
         return replace(
             self.stored(self.table.iloc[number].to_dict()),
@@ -199,10 +209,8 @@ class PairResults:
 
         Errors are infinite without a pose and NaN without a true pose. Lengths are in `unit`, and named by it.
         """
-        keys = self.table[["timestamp", "device_id"]]
-        rotation_deg, translation = pose_errors(self.poses, truth, keys) if len(self) else (np.zeros(0), np.zeros(0))
-        table = self.table.rename(columns=POSES_UNIT)
-        table = table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation)
+        turned, moved = pose_errors(self.poses, truth, self.table[["timestamp", "device_id"]])
+        table = self.table.rename(columns=POSES_UNIT).assign(rotation_error_deg=turned, translation_error_m=moved)
         lengths = table.columns.intersection(["translation_error_m", "position_std_m"])
         return named_by_unit(table.assign(**table[lengths] / self.unit[1]), self.unit[0])
 
@@ -274,8 +282,8 @@ def find_query(query: object, images: Mapping[str, int], count: int, what: str =
     if isinstance(query, int | np.integer) and not isinstance(query, bool):
         if 0 <= query < count:
             return int(query)
-        found = f"found {query}, expected a number from 0 to {count - 1}, or the name of an image"
-        raise ArtifactError(f"{what}: {found}.")
+        known = f", expected a number from 0 to {count - 1}, or the name of an image." if count else ". There are none."
+        raise ArtifactError(f"{what}: found {query}{known}")
     if not isinstance(query, str | Path):
         raise ArtifactError(f"{what}: found {query!r}, expected a number or the name of an image.")
     name = image_name(str(query))

@@ -32,7 +32,7 @@ from toolkit.files import (
 )
 from toolkit.geometry import Ints
 from toolkit.manifest import nearest
-from toolkit.pose.base import NetworkMatches, Query, QueryInput, QueryResult, References, Status, statuses
+from toolkit.pose.base import NetworkMatches, Query, QueryInput, QueryResult, References, Status
 from toolkit.results.localized import LocalizedPair
 from toolkit.results.metrics import is_posed, worst_first
 from toolkit.results.pair import (
@@ -241,15 +241,16 @@ class WorstQueries:
         """Take the queries of all pairs, or those of a device, in a folder of poses that have stored correspondences
         and can be read. The folders are as for `InspectedPair`.
         """
-        pairs: list[InspectedPair] = []
+        pairs, self._errors = list[InspectedPair](), list[ToolkitError]()
         for mapped, queried in pairs_of(poses_dir, ".h5"):
             if map_device in ("all", mapped) and query_device in ("all", queried):
-                with suppress(*OF_THE_DATA):  # an unfinished pair has no table, or a session broke after a good run
+                try:
                     pairs.append(InspectedPair(mapped, queried, poses_dir, None, map_dir, sessions_root))
+                except OF_THE_DATA as error:  # an unfinished pair has no table, or a session broke after a good run
+                    self._errors.append(error)
         queries = [(pair, number) for pair in pairs for number in range(len(pair))]
         tables = [pair.localized.localizations.errors for pair in pairs]
-        order = worst_first(pd.concat(tables, ignore_index=True)).tolist() if queries else []
-        self._queries = [queries[k] for k in order]
+        self._queries = [queries[k] for k in worst_first(pd.concat(tables, ignore_index=True))] if queries else []
         from toolkit.figures.query_images import shown_name
 
         self.names = [f"{pair.label}: {shown_name(pair.names[number])}" for pair, number in self._queries]
@@ -260,33 +261,30 @@ class WorstQueries:
         columns = ["map_device", "query_device", "status", "num_inliers", *errors, "image"]
         rows = []
         for pair, number in self._queries[:most]:
-            devices = dict(zip(columns, pair.localized.results.devices, strict=False))
-            rows.append({**pair.localized.localizations.errors.iloc[number].to_dict(), **devices})
+            row = pair.localized.localizations.errors.iloc[number].to_dict()
+            rows.append(row | dict(zip(columns, (*pair.localized.results.devices, row["status_text"]), strict=False)))
         return pd.DataFrame(rows).reindex(columns=columns).replace(np.inf, np.nan)
 
     def look(self, rank: int | str = 0) -> "Answer":
         """Return a query by its rank, 0 for the worst of all, or by the name of one of its images.
 
         `worst` is the worst one with matches, as those without, such as a torn file, have little to show. A query that
-        was localized in several maps is returned where it is worst. Raise ArtifactError if there is none.
+        was localized in several maps is returned where it is worst. Raise ArtifactError if there is none, or the error
+        of the first pair if none can be read.
         """
+        if self._errors and not self._queries:
+            raise self._errors[0]
         if rank == WORST:
-            tables = (pair.localized.results.table for pair, _ in self._queries)
-            matched = (table.get("num_matches", table["timestamp"]).iloc[number]
-                       for table, (_, number) in zip(tables, self._queries, strict=True))  # fmt: skip
-            rank = next((at for at, count in enumerate(matched) if count > 0), 0)
+            rows = (pair.localized.results.table.iloc[number] for pair, number in self._queries)
+            rank = next((at for at, row in enumerate(rows) if row.get("num_matches", 1) > 0), 0)
         pair, number = self._queries[find_query(rank, self._worst_of_image, len(self._queries))]
         return pair.look(number)
 
     @cached_property
     def _worst_of_image(self) -> dict[str, int]:
         """Rank of the worst localization of each image, by its name."""
-        worst = dict[str, int]()
-        for rank, (pair, number) in enumerate(self._queries):
-            session = pair.localized.query_session
-            for row in pair.localized.rows[number].tolist():
-                worst.setdefault(session.image_name(row), rank)
-        return worst
+        ranked = reversed([(rank, pair.localized, number) for rank, (pair, number) in enumerate(self._queries)])
+        return {pair.query_session.image_name(row): rank for rank, pair, number in ranked for row in pair.rows[number]}
 
 
 # One of many queries in a notebook
@@ -313,18 +311,16 @@ def choose(queries: Any, chosen: int | str = 0) -> Choice:
     """Show a query of `RetrievedPair`, `InspectedPair` or `WorstQueries`, and a list to choose another in its place.
 
     The figure is ordinary output, which a saved notebook keeps. There is no list when the pipeline runs the notebook.
-    `chosen` is the number or name of the first query, which must exist, unless it is a number and there are no queries.
+    `chosen` is the number or name of the first query, which must exist, unless there are no queries and it is no name.
     """
     from IPython.display import display
 
-    if not len(queries.names) and isinstance(chosen, int):
+    if not len(queries.names) and (isinstance(chosen, int) or chosen == WORST):
         print("There are no queries to show.")
         return Choice(None)
     try:
         choice = Choice(queries.look(chosen))
     except ArtifactError as error:
-        if not str(error).startswith("query: "):
-            raise
         raise ArtifactError(f"inspect: {str(error).removeprefix('query: ')}") from None
     if TEXT_BARS in os.environ:
         display(choice.shown)
@@ -397,10 +393,9 @@ class Run:
         return cls(path)
 
     def _repr_html_(self) -> str:
-        queries, keys = self.queries, ["scene", "map_device", "query_device"]
-        of_status = queries.assign(status=statuses(queries["status"])).groupby([*keys, "status"])
+        of_status = self.queries.groupby(["scene", "map_device", "query_device", "status"])
         counts = of_status.size().unstack(fill_value=0).reindex(columns=list(Status), fill_value=0)
-        told = counts.to_html() if len(queries) else "<p>No queries: a map alone.</p>"
+        told = counts.to_html() if len(counts) else "<p>No queries: a map alone.</p>"
         return f"<p><b>{escape(self.path.name)}</b>: {escape(str(self.path))}</p>{told}"
 
     @cached_property
@@ -436,7 +431,7 @@ class Run:
 
     @cached_property
     def queries(self) -> pd.DataFrame:
-        """One row per query and map: scene, map_device, query_device, and the columns of `poses/<pair>.csv`.
+        """One row per query and map: scene, map_device, query_device, and the columns of `PairResults.table`.
 
         Raises:
             ArtifactError: a table is damaged.
@@ -446,7 +441,7 @@ class Run:
             for devices, path in pairs_of(SceneFiles(self.path, scene).poses_dir).items():
                 tables[scene, *devices] = PairResults.open(path).table
         if not tables:
-            return pd.DataFrame(columns=[*keys, "status"])
+            return pd.DataFrame(columns=[*keys, "status", "status_text"])
         return pd.concat(tables, names=keys).reset_index(keys).reset_index(drop=True)
 
     def result(self, name: str = "worst", map_device: str | None = None, scene: str | None = None) -> QueryResult:
@@ -459,6 +454,7 @@ class Run:
 
         Raises:
             ArtifactError: no query has this name, or several do; or its stored results are damaged.
+            ToolkitError: no pair of the run can be read: why the first one cannot.
         """
         poses = SceneFiles(self.path, self._scene(scene)).poses_dir
         return WorstQueries(poses, map_device=map_device or "all").look(name).result
@@ -477,8 +473,7 @@ class Run:
             middle = session.images[["timestamp"]].assign(device_id=session.device_ids).iloc[[len(session) // 2]]
             return scene_map.query_of_session(session, session.rows_of_keyframes(middle)[0])
         of_map = queries[(queries["map_device"] == map_device) & (queries["scene"] == self._scene(scene))]
-        status = statuses(of_map["status"])
-        of_map = of_map.assign(sure=status == str(Status.OK))[status != str(Status.FAILED)]
+        of_map = of_map.assign(sure=of_map["status"] == Status.OK)[of_map["status"] != Status.FAILED]
         if not len(of_map):
             raise ArtifactError(f"{self.path}: no query was localized in the map of {map_device!r}.")
         best = of_map.sort_values(["sure", "num_inliers"], ascending=False, kind="stable")  # networks have no inliers

@@ -294,9 +294,9 @@ class View3D:
         """Write a recording for the rerun viewer, `.rrd`, and return its path."""
         cameras = [answer.details.cameras[0] for answer in self.answers]
         errors = [answer.error or (np.nan, np.nan) for answer in self.answers]
-        rotation_deg, translation = np.reshape(errors, (-1, 2)).T
+        turned, moved = np.reshape(errors, (-1, 2)).T
         table = pd.DataFrame([answer.result.to_row(0, "") for answer in self.answers])
-        table = table.assign(rotation_error_deg=rotation_deg, translation_error_m=translation)
+        table = table.assign(status_text=table["status"], rotation_error_deg=turned, translation_error_m=moved)
         estimated = np.array([camera.world_from_cam for camera in cameras]).reshape(-1, 4, 4)
         true = np.array([camera.world_from_cam_true for camera in cameras]).reshape(-1, 4, 4)
         names = [shown_name(answer.name) for answer in self.answers]
@@ -548,7 +548,7 @@ class _ChosenWriter:
 def describe(queries: Localizations, k: int) -> str:
     """Return one line of text about a query: name, status, errors, inliers."""
     row = named_as_meters(queries.errors.iloc[[k]]).iloc[0]
-    parts = [str(queries.names[k]), str(row["status"])]
+    parts = [str(queries.names[k]), str(row["status_text"])]
     if np.isfinite(row["translation_error_m"]):
         parts.append(f"off by {row['rotation_error_deg']:.2g}°, {row['translation_error_m']:.3g} {queries.unit[0]}")
     return ", ".join(filter(None, [*parts, support_of(row)]))
