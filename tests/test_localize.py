@@ -266,10 +266,8 @@ def test_wrong_questions_are_refused(
 
 
 def test_a_pose_without_covariance_leaves_the_others_theirs(tmp_path: Path) -> None:
-    covariances = np.eye(6), np.full((6, 6), np.nan)
-    row = {"device_id": "a", "world_from_rig": np.eye(4)}
-    rows = [row | {"timestamp": time, "covariance": covariances[time]} for time in (0, 1)]
-    localize._write_poses(tmp_path / "pair.txt", rows, LocalizeSettings())
+    results = [QueryResult(Status.OK, "", np.eye(4), covariance) for covariance in (np.eye(6), None)]
+    localize._write_poses(tmp_path / "pair.txt", [(0, "a"), (1, "a")], ["", ""], results, LocalizeSettings())
     written = Trajectory.read(tmp_path / "pair.txt").covariances
     np.testing.assert_array_equal(written, [np.eye(6), np.full((6, 6), np.nan)])
 

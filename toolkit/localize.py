@@ -3,7 +3,7 @@
 import json
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
@@ -40,7 +40,7 @@ from toolkit.files import (
 from toolkit.geometry import Ints
 from toolkit.manifest import LocalizeSettings
 from toolkit.mapping.build import map_settings
-from toolkit.pose.base import Query, QueryInput, QueryResult, References, status_counts
+from toolkit.pose.base import Correspondences, Query, QueryInput, QueryResult, References, status_counts
 from toolkit.pose.map_matching import MAX_SHARES, SIGNIFICANCE
 from toolkit.pose.pnp import PNP_FORMAT
 from toolkit.prediction.feed_forward import FeedForwardAnswer, FeedForwardLocalizer
@@ -240,13 +240,21 @@ class _Stage(Remade):
         return _Stage.elsewhere(self.folders, self.settings, self.queries, True, 0, time.time_ns(), self.networks)
 
 
-_Todo = tuple[str, str, int]
-"""Name of a query's item, fingerprint of its sources, and number of the query."""
-_Task = tuple[int, QueryInput, Any, float]
-"""Number of a query, the query, what is known of it (a prediction, or its first result), and seconds spent on it."""
-_FEW, _RETRIED = "/few", "/retried"
-"""End the names of a query's items with the fallback features, of few references and of all: an item's name chooses the
-references. It has no arrays if earlier correspondences count."""
+class _Task(NamedTuple):
+    """A query to localize: at first with the features of the map, then in rounds with the fallback features. The result
+    of each round is an item.
+    """
+
+    item: str
+    """Name of the item."""
+    source: str
+    """Fingerprint of what all results are made from."""
+    number: int
+    """Of the query."""
+    asked: Sequence[References] = ()
+    """What the fallback features are matched with, see `Map.asked_next`; empty at first."""
+    seconds: float = 0.0
+    """Spent on it before, together with others."""
 
 
 class _Pair:
@@ -333,10 +341,11 @@ class _Pair:
         unfinished = False
         if not skipped:
             self.open()
-            rows, unfinished = self._localize(record, h5_attributes)
+            results, unfinished = self._localize(record, h5_attributes)
             write_text(self.map_record, json.dumps(self.map.record(), indent=1) + "\n")
             write_sidecar(self.map_record, self._made_from(maps))  # its own: all pairs of the map share it
-            _write_poses(self.file("txt"), rows, stage.settings)
+            images = self.session.own_names(self.rows)
+            _write_poses(self.file("txt"), self.keys, images, results, stage.settings)
         if update_attributes(self.file("h5"), h5_attributes) or not skipped:
             files = self.file("txt"), record, [self.file("csv"), self.file("h5")]
             captured = pose_sources(stage.capture[f"{self.devices[0]}_map"], self.session)
@@ -386,170 +395,148 @@ class _Pair:
     def query(self, number: int) -> QueryInput:
         return self.stored.query(self.map, self.rows[number])
 
-    def _localize(self, record: dict[str, Any], h5_attributes: Mapping[str, str]) -> tuple[list[dict[str, Any]], bool]:
-        """Localize the queries that are not localized yet, and write the `.h5` file. Return the row of each query, with
-        world_from_rig (4, 4) and covariance (6, 6), NaN if unknown; and whether a query failed with an internal error.
+    def _localize(self, record: dict[str, Any], h5_attributes: Mapping[str, str]) -> tuple[list[QueryResult], bool]:
+        """Localize the queries that are not localized yet, and write the `.h5` file. Return the result of each query,
+        without its correspondences; and whether a query failed with an internal error.
         """
         names, source = [query_group(*key) for key in self.keys], fingerprint(record)
         numbers = {name: number for number, name in enumerate(names)}  # a keyframe list may repeat a query
+        first = [_Task(name, source, number) for name, number in numbers.items()]
         with Items(self.file("items"), skip_existing=self.stage.skip_existing) as items:
             items.drop_damaged()
-            todo = items.left((name, source, number) for name, number in numbers.items())
-            faulty = self._distribute(items, todo)
-            if self.map.fallback is not None:
-                for end in (_FEW, _RETRIED):
-                    items.flush()
-                    # The other queries have no features of the fallback.
-                    del self.stored.stores[len(self.map.kinds) :], self.stored.matches[len(self.map.kinds) :]
-                    retried = [(name + end, source, number) for name, number in numbers.items() if number not in faulty]
-                    todo = [one for one in items.left(retried) if self._is_open(items, one)]
-                    if todo:
-                        started = time.perf_counter()
-                        self.add_fallback(items, todo)
-                        faulty |= self._distribute(items, todo, (time.perf_counter() - started) / len(todo))
+            faulty, asking = self._distribute(items, items.left(first)), first
+            while asking := self._asking(items, [task for task in asking if task.number not in faulty]):
+                faulty |= self._distribute(items, self.with_fallback(asking))
         # If the run is killed before it writes the new poses, no poses of an earlier run may lie beside this file.
         self.remove_poses()
-        rows = dict[str, dict[str, Any]]()
+        results, none = dict[str, QueryResult](), Correspondences()
 
         def groups() -> Iterator[tuple[str, dict[str, Any]]]:
-            for name, number in numbers.items():
-                if number in faulty:
-                    row, arrays = faulty[number].to_row(*self.keys[number]), faulty[number].arrays()
-                else:
-                    known = [name + end for end in (_RETRIED, _FEW, "") if items.is_current(name + end, source)]
-                    row, arrays = items.note(known[0]), next(filter(None, map(items.__getitem__, known)))
-                rows[name] = row | {key: arrays[key] for key in ("world_from_rig", "covariance")}
-                yield name, arrays
+            for task in first:
+                result = faulty.get(task.number) or self._results(items, task)[-1]
+                yield task.item, result.arrays()
+                results[task.item] = replace(result, correspondences=none)  # they fill memory
 
         write_groups(self.file("h5"), groups(), h5_attributes)
-        images = self.session.own_names(self.rows)
-        return [rows[name] | {"image": image} for name, image in zip(names, images, strict=True)], bool(faulty)
+        return [results[name] for name in names], bool(faulty)
 
-    def _distribute(self, items: Items, todo: Sequence[_Todo], *retry_s: float) -> dict[int, QueryResult]:
+    def _distribute(self, items: Items, todo: Sequence[_Task]) -> dict[int, QueryResult]:
         """Localize queries, with the workers of the cluster if there is one; see `localize_into`."""
-        arguments, size = (self.stage.of_worker, *self.devices, *retry_s), self.map.localizer.batch_size
-        todo = items.distribute(_do_share, todo, arguments, self.label, "query", 1 if retry_s else size)
-        return self.localize_into(items, todo, *retry_s)
-
-    def _stored(self, items: Items, todo: _Todo) -> tuple[QueryResult, QueryResult]:
-        """Return the stored results of a query: from the features that every query has, and the latest of a retry."""
-        name = todo[0].removesuffix(_FEW).removesuffix(_RETRIED)
-        first = QueryResult.from_row(items.note(name), items[name])
-        if not items.is_current(name + _FEW, todo[1]):
-            return first, first
-        return first, QueryResult.from_row(items.note(name + _FEW), items[name + _FEW] or items[name])
-
-    def _is_open(self, items: Items, todo: _Todo) -> bool:
-        """Tell whether a query should be retried in the round of its item."""
-        first, latest = self._stored(items, todo)
-        unsure = self.map.is_unsure(first) and self.map.needs_fallback(*self.query(todo[2]), first)
-        return unsure and bool(self._asked(todo, first, latest))
-
-    def _asked(self, todo: _Todo, first: QueryResult, latest: QueryResult) -> Sequence[References]:
-        """Return the references that a query asks in the round of its item, see `Map.references_of_retry`."""
-        references = self.stored.references_of(self.map, self.rows[todo[2]])
-        return self.map.references_of_retry(todo[0].endswith(_FEW), references, first, latest)
-
-    def add_fallback(self, items: Items, todo: Sequence[_Todo]) -> None:
-        """Extract and match the fallback features of queries."""
-        self._add_features(self.map.escalation, {one[2]: self._asked(one, *self._stored(items, one)) for one in todo})
-
-    def localize_into(
-        self, items: Items, todo: Sequence[_Todo], retry_s: float | None = None
-    ) -> dict[int, QueryResult]:
-        """Localize queries and add them as items; return those that failed with an internal error, by number: they get
-        no item, so the next run tries them again.
-
-        With `retry_s`, retry unsure queries with the fallback features, whose extraction took these seconds per query;
-        an item gets arrays only if the result is better.
-        """
-        faulty, earlier = dict[int, QueryResult](), dict[int, QueryResult]()
-        of_number = {number: (name, source) for name, source, number in todo}
-
-        def retried() -> Iterator[_Task]:
-            for one in todo:
-                first, latest = self._stored(items, one)
-                earlier[one[2]] = latest
-                yield one[2], (self.query(one[2])[0], self._asked(one, first, latest)), latest, retry_s or 0.0
-
-        if retry_s is None:
-            results = self._run(self._locate, self._predicted(list(of_number)), len(todo))
-        else:
-            results = self._run(self._retry, retried(), len(todo))
-        for number, result in results:
-            if result.is_internal:
-                faulty[number] = result
-                if number in earlier and result.world_from_rig is None:  # what was found before the retry stays
-                    remark = "; ".join(filter(None, [earlier[number].remark, result.reason]))
-                    faulty[number] = replace(earlier[number], remark=remark)
-            else:
-                same = number in earlier and result.correspondences is earlier[number].correspondences
-                items.add(*of_number[number], None if same else result.arrays(), result.to_row(*self.keys[number]))
+        multiple = 1 if any(task.asked for task in todo) else self.map.localizer.batch_size
+        arguments = self.stage.of_worker, *self.devices
+        todo = items.distribute(_do_share, todo, arguments, self.label, "query", multiple)
+        faulty = self.localize_into(items, todo)
+        items.flush()
         return faulty
 
-    def _run(
-        self, locate: Callable[[Query, Any, Any], QueryResult], tasks: Iterator[_Task], count: int
-    ) -> Iterator[tuple[int, QueryResult]]:
-        """Yield the results of queries; `locate` takes a query, its references, and what else a task has."""
+    def _results(self, items: Items, task: _Task) -> list[QueryResult]:
+        """Return the stored results of a query, one per round."""
+        results, arrays = list[QueryResult](), dict[str, Any]()
+        while items.is_current(item := self._item(task, len(results)), task.source):
+            arrays = items[item] or arrays  # none are stored where the earlier ones count
+            results.append(QueryResult.from_row(items.note(item), arrays))
+        return results
 
-        def run(task: _Task) -> tuple[int, QueryResult]:
-            number, (query, references), known, seconds = task
-            try:
-                if not query.views:
-                    method = self.map.settings.method
-                    return number, QueryResult.failed("no images of this device at this time", found_by=method)
-                result = locate(query, references, known)
-            except Exception as error:  # one bad query never ends a run
-                reason = reason_of(error, f"localizing {query.views[0].name}")
-                result = self.map.finished(query, QueryResult.failed(reason))
-            return number, replace(result, seconds=result.seconds + seconds)
+    def _item(self, task: _Task, number: int) -> str:
+        """Return the name of the item of a round, by its number."""
+        return query_group(*self.keys[task.number]) + (f"/{number}" if number else "")
 
-        results = prefetch(run, tasks, self.stage.workers)
-        return iter(tqdm(results, total=count, desc=self.label, unit="query", disable=not count))
+    def _asking(self, items: Items, tasks: Sequence[_Task]) -> list[_Task]:
+        """Return the next round of those queries that fallback features may help."""
+        others = slice(len(self.map.kinds), None)  # features of the last round, which not all queries have
+        del self.stored.stores[others], self.stored.matches[others]
+        asking = list[_Task]()
+        for task in tasks if self.map.fallback is not None else ():
+            results = self._results(items, task)
+            if not self.map.is_unsure(results[0]):
+                continue  # without its features, which take time to read
+            if asked := self.map.asked_next(*self.query(task.number), results):
+                asking.append(task._replace(item=self._item(task, len(results)), asked=asked))
+        return asking
 
-    def _locate(self, query: Query, references: Sequence[References], prediction: Any) -> QueryResult:
-        return self.map.locate(query, None, references, prediction, fallback=False)
-
-    def _retry(self, query: Query, references: Sequence[References], first: QueryResult) -> QueryResult:
+    def with_fallback(self, todo: Sequence[_Task]) -> list[_Task]:
+        """Extract and match the fallback features of queries, and return these with the seconds that it took."""
         started = time.perf_counter()
-        result = self.map.retry(query, self.map.match(query, references, self.map.fallback), first)
-        return replace(result, seconds=first.seconds + time.perf_counter() - started)
+        self._add_features(self.map.escalation, {task.number: task.asked for task in todo})
+        seconds = (time.perf_counter() - started) / len(todo)
+        return [task._replace(seconds=seconds) for task in todo]
 
-    def _predicted(self, numbers: Sequence[int]) -> Iterator[_Task]:
-        """Yield queries with the predictions of a network, which runs on batches of queries."""
+    def localize_into(self, items: Items, todo: Sequence[_Task]) -> dict[int, QueryResult]:
+        """Localize queries and add the results as items; return those that failed with an internal error, by number:
+        they get no item, so the next run tries them again.
+        """
+        faulty = dict[int, QueryResult]()
+        results = prefetch(partial(self._localized, items), self._opened(todo), self.stage.workers)
+        for task, result, arrays in tqdm(results, total=len(todo), desc=self.label, unit="query", disable=not todo):
+            if result.is_internal:
+                faulty[task.number] = result
+            else:
+                items.add(task.item, task.source, arrays, result.to_row(*self.keys[task.number]))
+        return faulty
+
+    def _localized(
+        self, items: Items, given: tuple[_Task, QueryInput, Any]
+    ) -> tuple[_Task, QueryResult, dict[str, Any] | None]:
+        """Return the task and the result of a query, and its arrays; None if they are those of the last round."""
+        task, (query, references), prediction = given
+        earlier, started = self._results(items, task)[-1] if task.asked else None, time.perf_counter()
+        try:
+            if earlier is not None:
+                result = self.map.retry(query, self.map.match(query, task.asked, self.map.fallback), earlier)
+            elif query.views:
+                result = self.map.solve(query, self.map.match(query, references), prediction)
+            else:
+                method = self.map.settings.method
+                result = QueryResult.failed("no images of this device at this time", found_by=method)
+        except Exception as error:  # one bad query never ends a run
+            reason = reason_of(error, f"localizing {query.views[0].name}")
+            if earlier is None:
+                result = self.map.finished(query, QueryResult.failed(reason))
+            else:  # what was found before stays
+                result = replace(earlier, remark="; ".join(filter(None, [earlier.remark, reason])))
+        spent = task.seconds + time.perf_counter() - started + (earlier.seconds if earlier else 0.0)
+        same = earlier is not None and result.correspondences is earlier.correspondences
+        return task, replace(result, seconds=spent), None if same else result.arrays()
+
+    def _opened(self, todo: Sequence[_Task]) -> Iterator[tuple[_Task, QueryInput, Any]]:
+        """Yield queries, at first with the predictions of a network, which runs on batches of queries."""
         size = self.map.localizer.batch_size
-        for start in range(0, len(numbers), size):
-            batch = numbers[start : start + size]
-            queries, started = [self.query(number) for number in batch], time.perf_counter()
-            predictions = self.map.predict(queries)
+        for start in range(0, len(todo), size):
+            batch = todo[start : start + size]
+            queries, started = [self.query(task.number) for task in batch], time.perf_counter()
+            predictions = [None] * len(batch) if batch[0].asked else self.map.predict(queries)
             seconds = (time.perf_counter() - started) / len(batch)
-            for number, query, prediction in zip(batch, queries, predictions, strict=True):
-                yield number, query, prediction, seconds
+            for task, query, prediction in zip(batch, queries, predictions, strict=True):
+                yield task._replace(seconds=task.seconds + seconds), query, prediction
 
 
-def _do_share(
-    items: Items, todo: Sequence[_Todo], stage: _Stage, map_device: str, query_device: str, *retry_s: float
-) -> None:
+def _do_share(items: Items, todo: Sequence[_Task], stage: _Stage, map_device: str, query_device: str) -> None:
     pair = _Pair(stage, map_device, query_device).open()
-    if retry_s:
-        pair.add_fallback(items, todo)
-    pair.localize_into(items, todo, *retry_s)
+    if any(task.asked for task in todo):
+        pair.with_fallback(todo)
+    pair.localize_into(items, todo)
 
 
-def _write_poses(path: Path, rows: Sequence[dict[str, Any]], settings: LocalizeSettings) -> None:
-    """Write the table and the poses of a pair; the poses last, because their file marks the pair as finished."""
+def _write_poses(
+    path: Path, keys: Sequence[tuple[int, str]], images: Sequence[str], results: Sequence[QueryResult],
+    settings: LocalizeSettings,
+) -> None:  # fmt: skip
+    """Write the table and the poses of a pair; the poses last, because their file marks the pair as finished.
+
+    `keys` are timestamp and device id of each query, `images` the names of its images.
+    """
     columns = [*COLUMNS, *(PREDICTION_COLUMNS if settings.predicts else [])]
     columns += FALLBACK_COLUMNS if settings.features.escalation else []
+    rows = [result.to_row(*key) | {"image": image} for key, image, result in zip(keys, images, results, strict=True)]
     table = pd.DataFrame(rows).rename(columns=POSES_UNIT).reindex(columns=columns)
     write_csv(path.with_suffix(".csv"), in_unit_of_poses(table, settings.unit))
-    posed = [row for row in rows if np.isfinite(row["world_from_rig"]).all()]
-    covariances = np.array([row["covariance"] for row in posed]).reshape(-1, 6, 6)
-    Trajectory.from_poses(
-        [row["timestamp"] for row in posed],
-        [row["device_id"] for row in posed],
-        np.array([row["world_from_rig"] for row in posed]).reshape(-1, 4, 4),
-        None if np.isnan(covariances).all() else covariances,
-    ).write(path)
+    posed = [number for number, result in enumerate(results) if result.world_from_rig is not None]
+    poses, covariances = (
+        np.array([results[number].arrays()[name] for number in posed]).reshape(-1, size, size)
+        for name, size in (("world_from_rig", 4), ("covariance", 6))
+    )
+    times, devices = ([keys[number][part] for number in posed] for part in (0, 1))
+    Trajectory.from_poses(times, devices, poses, None if np.isnan(covariances).all() else covariances).write(path)
 
 
 def explain_query(

@@ -103,13 +103,16 @@ def test_a_result_comes_back_from_its_row_and_arrays(posed: bool) -> None:
     first = replace(QUERIES[5, "phone"], num_inliers=12, num_matches=30, p_correct=0.97, rmse_px=0.5, seconds=0.25)
     if posed:
         written = replace(
-            first, world_from_rig=pose, covariance=covariance, camera_contradicted=True, found_by="pnp+near"
-        )
+            first, world_from_rig=pose, covariance=covariance, camera_contradicted=True, found_by="pnp+near",
+            focals_px=(450.5, np.nan), centers_px=((np.nan, np.nan), (320.5, 240.0)),
+        )  # fmt: skip
     else:
         written = replace(first, status=Status.FAILED, reason="too few inliers (3: within)", remark="torn.jpg")
     row = json.loads(json.dumps(written.to_row(5, "phone")))
     assert row["status"] == ("ok" if posed else "failed: too few inliers (3: within)")
     read = QueryResult.from_row(row, written.arrays())
+    assert json.dumps(read.to_row(5, "phone")) == json.dumps(row)
+    np.testing.assert_array_equal(read.focals_px, written.focals_px)
     assert (read.world_from_rig is not None) == (read.covariance is not None) == read.camera_contradicted == posed
     for name in ("status", "reason", "remark", "num_inliers", "num_matches", "p_correct", "rmse_px", "seconds"):
         assert getattr(read, name) == getattr(written, name), name

@@ -122,8 +122,11 @@ def test_an_ok_pose_asks_the_references_that_support_it_first() -> None:
     vague = replace(VAGUE, references=("c", "a", "b", "f", "d"))
 
     def asked(first: QueryResult) -> list[list[list[int]]]:
-        rounds = [scene_map.references_of_retry(few, references, first, first) for few in (True, False)]
-        return [[found.images.tolist() for found in part] for part in rounds if part]
+        query, results, rounds = Query([], np.eye(4)[None], [[]] * len(references)), [first], []
+        while part := scene_map.asked_next(query, references, results):
+            rounds.append([found.images.tolist() for found in part])
+            results.append(first)
+        return rounds
 
     every = [[5, 4, 3, 2, 1, 0], [4, 5]]
     assert asked(vague) == [[[5, 2, 1, 0], [5]], every]

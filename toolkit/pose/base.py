@@ -361,9 +361,11 @@ class QueryResult:
         Raises:
             ValueError, KeyError: an array has another shape or is missing.
         """
-        known = {name: value for name, value in row.items() if not pd.isna(value)}
+        known = {name: value for name, value in row.items() if not pd.isna(value) and value != ""}
         status, reason = Status.parse(str(known.get("status_text", known["status"])))
         kinds = {name: type(getattr(cls, name)) for name in _NUMBERS if name not in _FROM_OTHERS}
+        fitting = ("focal_px", "principal_point_px")
+        focals, centers = (str(known[key]).split(";") if key in known else [] for key in fitting)
         return cls(
             status,
             reason,
@@ -371,6 +373,8 @@ class QueryResult:
             remark=str(known.get("reason", "")),
             first_status=known.get("first_status"),
             first_seconds=known.get("first_seconds"),
+            focals_px=tuple(float(focal or "nan") for focal in focals),
+            centers_px=tuple((float(x), float(y)) for x, y in ((xy or "nan nan").split() for xy in centers)),
             **{name: kind(known[name]) for name, kind in kinds.items() if name in known},
             **({} if arrays is None else _of_arrays(arrays)),
         )

@@ -92,6 +92,7 @@ def localize_images(
             if sure_px is not None:
                 continue
             result = unknown.locate(focal_px)
+            # Unlike in `Map.retry`, rivals may come from a wrong focal length, so an `ok` result keeps its status.
             if result.status.rank >= results[number].status.rank and not result.camera_contradicted:
                 text = f"focal length {focal_px:.0f} px, from {len(sure)} other photographs of its camera"
                 results[number] = replace(result, remark="; ".join(filter(None, [text, result.remark])))
@@ -138,6 +139,7 @@ class _UnknownFocal:
         others: list[tuple[float, ...]] = [(focal_px * FOCAL_DOUBT, 0.0, 0.0), (focal_px / FOCAL_DOUBT, 0.0, 0.0)]
         if self.cropped:
             others += [(focal_px, *(sign * CENTER_DOUBT)) for sign in (*np.eye(2), *-np.eye(2))]
+        # No single pose tells this, so neither `Map.solve` nor `Map.finished` can.
         if result.status == Status.OK and not all(self.locate(*other).camera_contradicted for other in others):
             result = replace(result, status=Status.LOW_CONFIDENCE, reason=CAMERA)
             text += ", as other intrinsics do" if told else ", and the matches do not tell it"

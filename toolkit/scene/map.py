@@ -291,6 +291,7 @@ class Map:
         """
         return find_query(name, self.index_of, len(self.index_of), "map image")
 
+    @fixed_sums
     def solve(
         self,
         query: Query,
@@ -318,7 +319,6 @@ class Map:
         near: RoughPose | None = None,
         references: Sequence[References] | None = None,
         prediction: Any = None,
-        fallback: bool = True,
     ) -> QueryResult:
         """Return the pose of a query: describe, retrieve, match and solve, and the fallback features if it is unsure.
 
@@ -328,7 +328,6 @@ class Map:
                 features are also matched near the projections of the map points at this pose.
             references: those of each image; None: retrieve them.
             prediction: of a network for this query, see `predict`; None: predicted here if it is needed.
-            fallback: whether fallback features may be used; the localize stage extracts those of many queries at once.
 
         Returns:
             The result. Its `world_from_rig` (4, 4) is world_from_cam for a single image, and None if `status` is
@@ -343,16 +342,13 @@ class Map:
         references = self.retrieve(query, near=near) if references is None else references
         priors = [] if near is None else [self._prior(near, references)]
         result = self.solve(query, self.match(query, references), prediction, priors)
-        result = replace(result, seconds=time.perf_counter() - started)
-        if not fallback or not self.needs_fallback(query, references, result):
-            return result
-        query, first = self._with_fallback_features(query), result
-        for few in (True, False):
-            if asked := self.references_of_retry(few, references, first, result):
-                matches = self.match(query, asked, self.fallback)
-                query = replace(query, network_matches=matches.query.network_matches)  # the next round has them again
-                result = self.retry(query, matches, result, priors)
-        return replace(result, seconds=time.perf_counter() - started)
+        results = [replace(result, seconds=time.perf_counter() - started)]
+        while asked := self.asked_next(query, references, results):
+            query = self._with_fallback_features(query) if len(results) == 1 else query
+            matches = self.match(query, asked, self.fallback)
+            query = replace(query, network_matches=matches.query.network_matches)  # the next round has them again
+            results.append(self.retry(query, matches, results[-1], priors))
+        return replace(results[-1], seconds=time.perf_counter() - started)
 
     def predict(self, queries: Sequence[QueryInput]) -> list[Any]:
         """Return a network's prediction for each query, for `locate`; see `Localizer.predict`."""
@@ -366,29 +362,25 @@ class Map:
         # A pose without matches has no deviation (NaN) and counts as precise.
         return result.status is not Status.OK or result.position_std > limit
 
-    def needs_fallback(self, query: Query, references: Sequence[References], result: QueryResult) -> bool:
-        """Tell whether a result is not sure, and the query has what fallback features need."""
-        readable = zip(query.features, references, strict=True)
-        return self.is_unsure(result) and any(
-            not isinstance(features, str) and len(found.images) for features, found in readable
-        )
-
-    def references_of_retry(
-        self, few: bool, references: Sequence[References], first: QueryResult, latest: QueryResult
+    def asked_next(
+        self, query: Query, references: Sequence[References], results: Sequence[QueryResult]
     ) -> Sequence[References]:
-        """Return the references that fallback features are matched with in the round of few references, or in that of
-        all, which follows; empty if the round is left out. `first` needs them, and `latest` is the latest result.
+        """Return the references that fallback features are matched with in the next round, for `retry`; empty if there
+        is none. `results` are those of the rounds so far: the first without fallback features.
 
         An `ok` pose only lacks precision, so the references that support it most are asked before all are: these only
         if the few have not made the pose sure, or have moved it elsewhere.
         """
-        if not few:
-            moved = self._differ(first.world_from_rig, latest.world_from_rig)
-            return references if moved or self.is_unsure(latest) else []
+        first, latest = results[0], results[-1]
+        readable = zip(query.features, references, strict=True)
+        if not self.is_unsure(first) or all(isinstance(has, str) or not len(found.images) for has, found in readable):
+            return []
         best = [self.index_of[name] for name in first.references[:FEW_REFERENCES] if first.status is Status.OK]
-        chosen = [found.take(np.isin(found.images, best)) for found in references]
-        counts = [sum(len(found.images) for found in asked) for asked in (chosen, references)]
-        return chosen if 0 < counts[0] < counts[1] else []
+        few = [found.take(np.isin(found.images, best)) for found in references]
+        counts = [sum(len(found.images) for found in asked) for asked in (few, references)]
+        rounds = [few, references] if 0 < counts[0] < counts[1] else [references]
+        goes_on = self.is_unsure(latest) or self._differ(first.world_from_rig, latest.world_from_rig)
+        return rounds[len(results) - 1] if len(results) <= len(rounds) and goes_on else []
 
     @fixed_sums
     def retry(

@@ -2,7 +2,6 @@
 themselves, and to be tried with changes.
 """
 
-import copy
 import operator
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -55,6 +54,8 @@ Map = Any
 """A `scene.map.Map`, which imports this module."""
 FIXED_BY_MAP = ("unit", "world_up")
 """Settings that the length of the map and the turns of its images depend on, so they cannot change for a query."""
+_OF_SESSION = ("capture", "session", "search", "cameras", "estimated_cameras", "_upright")
+"""What a map keeps that depends on no setting that can change."""
 CHANGEABLE = ("localize", "retrieve.topk")
 """Sections and keys of a manifest that can be changed for one query."""
 
@@ -403,25 +404,21 @@ def with_changes(scene_map: Map, changes: Mapping[str, Any]) -> Map:
     if fixed := [name for name in FIXED_BY_MAP if getattr(settings, name) != getattr(before, name)]:
         do = f"To change it: {COMMAND} run MANIFEST --set localize.{fixed[0]}=..."
         raise ManifestError(f"localize.{fixed[0]}: cannot change for one query, as the whole map depends on it. {do}")
-    other = copy.copy(scene_map)
-    other.settings, other.original = settings, scene_map._first
-    for name in ("localizer", "fallback", "index_of", "in_lengths", "points", "_world_from_cams"):
-        other.__dict__.pop(name, None)
-    if settings.map != before.map and not settings.predicts:
-        other.mapped = []
-    anew = settings.features != before.features or settings.matcher != before.matcher
-    if anew or not scene_map.kinds:
-        kinds, other.escalation = create_methods(resolve_auto(settings))
-        extracted = {kind.name: kind.extractor.settings for kind in scene_map.kinds}
-        kept = {kind.name: kind for kind in kinds if extracted.get(kind.name) == kind.extractor.settings}
-        other.mapped = [
-            MappedFeatures(kind.map, kind.features, kind.name, kept[kind.name].matcher)
-            for kind in other.mapped
-            if kind.name in kept
-        ]
-        mapped = [kind.name for kind in other.mapped]
-        other.kinds = sorted(kinds, key=lambda kind: kind.name not in mapped)  # as `OnDemandLocalizer` wants them
-        other.__dict__.pop("_on_demand", None)
+    anew = settings.features != before.features or settings.matcher != before.matcher or not scene_map.kinds
+    kinds, escalation = create_methods(resolve_auto(settings)) if anew else (scene_map.kinds, scene_map.escalation)
+    extracted = {kind.name: kind.extractor.settings for kind in scene_map.kinds}
+    kept = {kind.name: kind for kind in kinds if extracted.get(kind.name) == kind.extractor.settings}
+    mapped = [
+        MappedFeatures(kind.map, kind.features, kind.name, kept[kind.name].matcher)
+        for kind in (scene_map.mapped if settings.map == before.map or settings.predicts else ())
+        if kind.name in kept
+    ]
+    names = [kind.name for kind in mapped]
+    kinds = sorted(kinds, key=lambda kind: kind.name not in names)  # as `OnDemandLocalizer` wants them
+    changed = {"settings": settings, "kinds": kinds, "mapped": mapped, "escalation": escalation}
+    other = replace(scene_map, original=scene_map._first, **changed)
+    shared = _OF_SESSION if anew else (*_OF_SESSION, "_on_demand")
+    vars(other).update((name, value) for name, value in vars(scene_map).items() if name in shared)
     return other
 
 
