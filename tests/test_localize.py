@@ -1591,8 +1591,8 @@ def test_threads_that_localize_again_have_nothing_to_load(
 
     monkeypatch.setattr(sequence, "prefetch", in_threads)
     keys, poses = session.keyframes(LIST), session.world_from_cam(ground_truth=True)
-    again = sequence._Relocalizer(files.poses_dir, files.scene, "ios", session)
-    (estimate,) = again(keys, [(0, RoughPose(poses[session.rows_of_keyframes(keys)[0][0]], 1.0, 0.1))])
+    again = sequence._Relocalizer(files.poses_txt("ios", "ios"), session, keys)
+    (estimate,) = again([(0, RoughPose(poses[session.rows_of_keyframes(keys)[0][0]], 1.0, 0.1))])
     assert estimate.status == "ok"
 
 
@@ -1615,7 +1615,8 @@ def test_a_query_is_localized_again_as_upright_as_the_networks_of_the_run_saw_it
         lambda _, query, near: shown.append([view.turns for view in query.views]) or QueryResult.failed("only shown"),
     )
     keys = session.keyframes(LIST)
-    sequence._Relocalizer(files.poses_dir, files.scene, "ios", session)(keys, [(0, RoughPose(np.eye(4), 1.0, 0.1))])
+    again = sequence._Relocalizer(files.poses_txt("ios", "hl"), session, keys)
+    again([(0, RoughPose(np.eye(4), 1.0, 0.1))])
     [rows, *_] = session.rows_of_keyframes(keys)
     turned = [3 if sensor.endswith("/hetrf") else 0 for sensor in session.images["sensor_id"].iloc[rows]]
     assert any(turned)

@@ -116,9 +116,7 @@ def near(world_from_cams: Floats, world_from_cam: Floats, distance: float, angle
     return is_near
 
 
-def pose_masks(
-    poses: Trajectory, map_images: Images, query_images: Images, distance: float, angle_deg: float
-) -> Masks:
+def pose_masks(poses: Trajectory, map_images: Images, query_images: Images, distance: float, angle_deg: float) -> Masks:
     """Return masks of the map images that are `near` the roughly known poses, world_from_device, of query images."""
     session, rows = query_images
     times, sensors = times_of(session.images)[rows], session.images["sensor_id"].iloc[rows]
