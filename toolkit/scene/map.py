@@ -74,7 +74,6 @@ from toolkit.results.pair import (
     last_localized,
     map_inputs,
     pairs_in_map,
-    read_settings,
 )  # fmt: skip
 from toolkit.scene.query import MapCameras, answer_of, query_from, show_matches, what_if, with_changes
 from toolkit.threads import fixed_sums
@@ -832,11 +831,11 @@ class ReferenceSearch:
 
     @cached_property
     def embed_settings(self) -> EmbedSettings:
-        return read_settings(self.files.embeddings / "settings.json", EmbedSettings)
+        return EmbedSettings.read(self.files.embeddings)
 
     @cached_property
     def retrieve_settings(self) -> RetrieveSettings:
-        return read_settings(self.files.retrieval_dir / "settings.json", RetrieveSettings)
+        return RetrieveSettings.read(self.files.retrieval_dir)
 
     @cached_property
     def embedders(self) -> list[Embedder]:
@@ -878,7 +877,7 @@ class ReferenceSearch:
     @cached_property
     def _verification(self) -> tuple[LocalMethod, Verifier]:
         """Features and verifier of the run's rerank stage."""
-        settings = read_settings(self.files.reranked_dir / "settings.json", RerankSettings)
+        settings = RerankSettings.read(self.files.reranked_dir)
         (method,) = create_local_methods(settings)
         store = FeatureStore.of_session(self.files.features, self.session.id, method.extractor.settings)
         return method, Verifier(settings, method.matcher, store)
