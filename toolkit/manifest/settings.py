@@ -313,7 +313,7 @@ class MaskSettings(Settings):
     prior without information, or one that contradicts those before it, is ignored.
     """
 
-    constants = {"retrieve.py": "poses_angle_deg gps_margin_m radio_share window_s"}
+    constants = {"embedders/masks.py": "poses_angle_deg gps_margin_m radio_share window_s"}
     poses: str | None = None
     """File with rough poses of the query devices in the map's frame, in the format of trajectories.txt; restricts the
     search to map images near these poses. null: no such prior."""
