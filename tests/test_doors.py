@@ -12,17 +12,21 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.rendered import copy_linked
+from tests.rendered import copy_linked, copy_shared
 from tests.unattended import no_kernels, run_cells
 from toolkit import notebook, pipeline
 from toolkit.capture import Capture
 from toolkit.capture.session import IMPORT_RECORD
-from toolkit.files import SceneFiles, map_record_path, read_map_record
+from toolkit.embed import embed_sessions
+from toolkit.embedders import EMBEDDERS
+from toolkit.files import SceneFiles, image_name, link_or_copy, map_record_path, read_map_record, read_references
 from toolkit.geometry import qt_from_pose
-from toolkit.localize import localize_image
+from toolkit.localize import Map, localize_image, localize_pairs
 from toolkit.models import da3
 from toolkit.notebook import notebook_path
+from toolkit.rerank import rerank_pairs
 from toolkit.results.pair import PairResults
+from toolkit.retrieve import retrieve_pairs
 from toolkit.scene.run import InspectedPair, Run
 
 
@@ -44,6 +48,9 @@ METHODS: dict[str, dict[str, Any]] = {
     "aliked": {"method": "pnp", "features": {"kinds": ["aliked"]}, "matcher": {"name": "mutual"}},
     "aliked, lightglue": {"method": "pnp", "features": {"kinds": ["aliked"]}},
     "sift and aliked": {"method": "pnp", "features": {"kinds": ["sift", "aliked"]}},
+    "sift, aliked where it is not sure": {
+        "method": "pnp", "features": {"kinds": ["sift"], "escalation": ["aliked"]}, "pnp": {"ok_probability": 1.0},
+    },
     "superpoint": {
         "method": "pnp", "features": SUPERPOINT, "matcher": {"name": "mutual"},
     },
@@ -56,7 +63,10 @@ METHODS: dict[str, dict[str, Any]] = {
 OF_A_RIG = ("pnp", "hybrid", "aliked", "superpoint", "a network, hybrid")
 DOORS = [(name, "ios", ["ios", "spot"] if name in OF_A_RIG else ["ios"]) for name in METHODS]
 """Methods, map device and query devices; one run has all pairs of a method, because kernels take seconds to start."""
-IN_OTHERS = ("nearest", "feed_forward", "hybrid", "aliked", "aliked, lightglue", "superpoint", "a network, hybrid")
+IN_OTHERS = (
+    "nearest", "feed_forward", "hybrid", "aliked", "aliked, lightglue", "superpoint", "a network, hybrid",
+    "sift, aliked where it is not sure",
+)  # fmt: skip
 """Methods whose runs have no kernels, because what they compute is in runs that have: "a network, feed_forward" has the
 size of images that users have, LightGlue gets the same features, and "sift and aliked" matches with it, too."""
 
@@ -144,6 +154,8 @@ def test_every_door_gives_the_same_poses(
         written = results.trajectory
         assert len(results) == 2
         assert unit is None
+        if "escalation" in str(method):
+            assert results.table["first_status"].notna().any(), "features that were asked for second"
         # by hand
         nested = {key: value for key, value in method.items() if isinstance(value, dict)}
         parameters = {key: value for key, value in method.items() if key not in nested} | {"settings": nested}
@@ -178,3 +190,105 @@ def test_every_door_gives_the_same_poses(
             (in_file,) = written.qt[(written.timestamps == timestamp) & (written.device_ids == device_id)]
             for other in (found, again):  # as a file has it, to the last digit
                 np.testing.assert_array_equal(qt_from_pose(other.world_from_rig), in_file)
+
+
+# What finds the references
+
+
+Change = dict[str, dict[str, Any]]
+UPRIGHT = {"model": "thumbnail", "upright": True}
+SEARCHES: dict[str, Change] = {
+    "as by default": {},
+    "reranked": {"rerank": {"topn": 6, "topk": 3}},
+    "several descriptors": {"embed": {"model": ["thumbnail", "vlad"]}},
+    "an index": {"retrieve": {"index": "IVF2,Flat", "index_candidates": 5, "nprobe": 1}},
+    "radio": {"retrieve": {"mask": {"radio": True}}},
+    "rough poses": {"retrieve": {"mask": {"poses": "rough.txt", "poses_distance": 2.0}}},
+    "radio, reranked": {"retrieve": {"mask": {"radio": True}}, "rerank": {"topn": 6, "topk": 3}},
+    "another up for the descriptors": {"embed": UPRIGHT | {"world_up": [1.0, 0.0, 0.0]}},
+    "another up for the localization": {"embed": UPRIGHT, "localize": {"world_up": [1.0, 0.0, 0.0]}},
+}
+BY_ALIKED = {"topn": 6, "topk": 3, "features": ["aliked"], "matcher": "mutual", "world_up": [1.0, 0.0, 0.0]}
+SEARCHES["another up for the reranking"] = {"rerank": BY_ALIKED}
+TAKE_SECONDS = ("several descriptors", "radio, reranked", "another up for the reranking")
+SEARCH_ROWS = [pytest.param(name, marks=[pytest.mark.slow] if name in TAKE_SECONDS else []) for name in SEARCHES]
+PAIR, LIST = {"map_device": "spot", "query_device": "hl"}, "keyframes_original"
+
+
+def found_by_stages(capture: Path, embedded: Path, folder: Path, change: Change) -> tuple[SceneFiles, Path]:
+    """Embed, retrieve, perhaps rerank, and localize by the nearest image; the run, and the file of its references."""
+    sessions, files = capture / "sessions", SceneFiles(folder, capture.name)
+    copy_shared(embedded, files.root)
+    embed_sessions(
+        sessions, files.embeddings, change.get("embed"), device=[*PAIR.values()], features_dir=files.features
+    )
+    settings = {"topk": change.get("rerank", {}).get("topn", 3)} | change.get("retrieve", {})
+    retrieve_pairs(sessions, files.embeddings, files.retrieval_dir, settings, queries=LIST, **PAIR)
+    references = files.retrieval_dir
+    if "rerank" in change:
+        references = files.reranked_dir
+        rerank_pairs(sessions, files.retrieval_dir, files.features, references, change["rerank"], **PAIR)
+    method = {"method": "nearest"} | change.get("localize", {})
+    localize_pairs(sessions, references, files.poses_dir, files.features, files.maps, method, queries=LIST, **PAIR)
+    return files, references / files.retrieval("spot", "hl").name
+
+
+def with_priors(capture: Path, folder: Path) -> Path:
+    """Copy a capture; its queries have signals of half of the map, and rough poses at one end of it."""
+    copy = folder / capture.name
+    shutil.copytree(capture, copy, copy_function=link_or_copy)
+    of_map, queries = (Capture.open(copy)[name] for name in ("spot_map", "hl_query"))
+    for session in (of_map, queries):
+        scans = dict[str, None]()
+        for row, (time, sensor) in enumerate(session.images[["timestamp", "sensor_id"]].to_numpy()):
+            heard = 2 * row // len(session) if session is of_map else 1
+            scans[f"{time}, {sensor.partition('/')[0]}/wifi, 02:00:00:00:00:0{heard}, 2412000, -50\n"] = None
+        (session.path / "wifi.txt").write_text("".join(scans))
+    place = ", ".join(map(str, of_map.world_from_cam()[-1, :3, 3]))
+    poses = (f"{time}, {device}, 1, 0, 0, 0, {place}\n" for time, device in queries.keyframes(LIST).to_numpy())
+    (folder / "rough.txt").write_text("".join(poses))
+    return copy
+
+
+@pytest.mark.parametrize("name", SEARCH_ROWS)
+def test_an_open_map_finds_for_a_query_what_the_stages_found(
+    small_capture: Path, small_embedded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest, caplog: pytest.LogCaptureFixture, name: str,
+) -> None:  # fmt: skip
+    """For images of a session: the same references, scores and poses, whatever the run searched with."""
+    change = SEARCHES[name]
+    if change.get("rerank") == BY_ALIKED:
+        request.getfixturevalue("learned_weights")
+    monkeypatch.setitem(EMBEDDERS, "thumbnail", "tests.embedders.test_fusion:Thumbnail")
+    monkeypatch.chdir(tmp_path)
+    has_priors = "mask" in change.get("retrieve", {})
+    capture = with_priors(small_capture, tmp_path) if has_priors else small_capture
+    files, references = found_by_stages(capture, small_embedded, tmp_path / "run", change)
+    scene_map, session = Map.open(files.run, files.scene, "spot"), Capture.open(capture)["hl_query"]
+    lines = {image_name(line["path"]): line["topk"] for line in read_references(references, "path")}
+    results, limited = PairResults.open(files.poses_txt("spot", "hl")), False
+    assert len(results) == len(results.trajectory.qt) == 3
+    for number, rows in enumerate(session.rows_of_keyframes(results.table)):
+        query = scene_map.query_of_session(session, rows)
+        found = scene_map.retrieve(query)
+        for image, (view, of_image) in enumerate(zip(query.views, found, strict=True)):
+            assert found.names(image) == [image_name(one["path"]) for one in lines[view.name]]
+            np.testing.assert_array_equal(of_image.scores, [one["score"] for one in lines[view.name]])
+        result = scene_map.locate(query)
+        np.testing.assert_array_equal(qt_from_pose(result.world_from_rig), results.trajectory.qt[number])
+        assert result.references == results[number].references
+        if has_priors:
+            paths = [session.image_path(row) for row in rows.tolist()]
+            outside = scene_map.retrieve(scene_map.query(paths, session.cameras(rows), session.rig_from_cam(rows)))
+            limited |= any(outside.names(image) != found.names(image) for image in range(len(rows)))
+    if not has_priors:
+        return
+    assert limited, "images from outside a session have no priors"
+    assert sum("from outside a session" in one.getMessage() for one in caplog.records) == 1, "said once"
+    other = change | {"retrieve": change["retrieve"] | {"topk": 2}}
+    if "rerank" not in change:  # a run with fewer references, and an open map that is asked for fewer
+        _, references = found_by_stages(capture, small_embedded, tmp_path / "other", other)
+        for line in read_references(references, "path"):
+            row = session.row_of_name[image_name(line["path"])]
+            (of_query,) = scene_map.retrieve(scene_map.query_of_session(session, np.array([row])), 2)
+            np.testing.assert_array_equal(of_query.scores, [one["score"] for one in line["topk"]])

@@ -33,6 +33,7 @@ from toolkit.capture.session import IMPORT_RECORD
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.embed import embed_sessions
 from toolkit.embedders import EMBEDDERS
+from toolkit.embedders import references as search
 from toolkit.errors import ArtifactError, CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.evaluate import evaluate_scene
 from toolkit.features.features import KINDS, LocalFeatures, MutualMatcher, SiftExtractor, SiftSettings, unit_descriptors
@@ -901,9 +902,9 @@ def test_a_picture_is_turned_for_what_the_run_turned_images_for(
     files = finished[0]
     scene_map = Map.open(files.run, files.scene, "ios")
     scene_map.settings = LocalizeSettings.of({"method": "feed_forward"})
-    scene_map.search.embed_settings = EmbedSettings.of({"upright": upright})  # type: ignore[misc]
-    learned = Learned(np.ones(scene_map.search._descriptors.shape[1], np.float32))
-    scene_map.search.embedders = [learned]  # type: ignore[misc]
+    scene_map.search.embed_settings = EmbedSettings.of({"upright": upright})
+    learned = Learned(np.ones(scene_map.search.vectors.shape[1], np.float32))
+    scene_map.search.embedders = [learned]
     asked: list[Query] = []
     localizer = AsManyAsFeatures(scene_map.mapped)
     localizer.solve = lambda matches, *_: asked.append(matches.query) or QueryResult(Status.OK)  # type: ignore
@@ -1074,13 +1075,13 @@ def test_a_learned_embedder_is_given_colors(small_capture: Path, finished: tuple
     expected = localize_image(scene_map, path, camera)
     store = extract_session(session, files.features)
     learned = Learned(scene_map.search.embedders[0].embed([store[session.image_name(0)]])[0])
-    scene_map.search.embedders = [learned]  # type: ignore[misc]
+    scene_map.search.embedders = [learned]
     np.testing.assert_array_equal(localize_image(scene_map, path, camera).world_from_rig, expected.world_from_rig)
     assert learned.seen == [(camera.height, camera.width, 3)]
     learned.min_side = camera.height // 4
     np.testing.assert_array_equal(localize_image(scene_map, path, camera).world_from_rig, expected.world_from_rig)
     assert learned.seen[1] == (camera.height // 4, camera.width // 4, 3), "as the stage decodes it"
-    scene_map.search.embedders = [Learned(np.zeros(7, np.float32))]  # type: ignore[misc]
+    scene_map.search.embedders = [Learned(np.zeros(7, np.float32))]
     with pytest.raises(ArtifactError, match="expected 7 of learned"):
         localize_image(scene_map, path, camera)
 
@@ -1282,7 +1283,7 @@ def test_a_picture_has_the_references_of_a_run_with_several_descriptors(
         strict=False,
     ):
         camera = session.camera(session.images["sensor_id"].iloc[of_query[0]])
-        scene_map.search.embed_settings = as_run  # type: ignore[misc]
+        scene_map.search.embed_settings = as_run
         pose = localize_image(scene_map, session.image_path(int(of_query[0])), camera).world_from_rig
         assert ", ".join(repr(float(number)) for number in geometry.qt_from_pose(pose)) in line
         expected = rows[session.image_name(int(of_query[0]))]
@@ -1292,7 +1293,7 @@ def test_a_picture_has_the_references_of_a_run_with_several_descriptors(
         np.testing.assert_allclose(answers[-1][0].scores, stated, atol=1e-6)  # a batch of another size
         row = tables[0]["abs_path"].map(image_name).tolist().index(session.image_name(int(of_query[0])))
         # Stored vectors are normalized already, and normalizing once more can change their last bit.
-        scene_map.search.embed_settings = as_run.model_copy(update={"normalize": False})  # type: ignore[misc]
+        scene_map.search.embed_settings = as_run.model_copy(update={"normalize": False})
         (again,) = scene_map.retrieve(described([vectors[row : row + 1] for vectors in stored]))
         np.testing.assert_array_equal(again.scores, stated)
 
@@ -1581,11 +1582,12 @@ def test_threads_that_localize_again_have_nothing_to_load(
     opened: list[Map] = []
     open_map = Map.open
     monkeypatch.setattr(Map, "open", lambda *run: opened.append(open_map(*run)) or opened[-1])
-    loaders = ["PnpLocalizer", "upright_turns", "create_embedder", "open_descriptors", "load_index"]
+    loaders = [(maps, "PnpLocalizer"), (maps, "upright_turns"), (search, "upright_turns")]
+    loaders += [(search, name) for name in ("create_embedder", "open_descriptors", "load_index")]
 
     def in_threads(localize: Callable[[int], QueryResult], numbers: range, _: int) -> list[QueryResult]:
-        for name in loaders:
-            monkeypatch.setattr(maps, name, Mock(side_effect=AssertionError(name)))
+        for module, name in loaders:
+            monkeypatch.setattr(module, name, Mock(side_effect=AssertionError(name)))
         assert all("_method" in vars(kind) for kind in opened[0].escalation)
         return [localize(number) for number in numbers]
 
@@ -1603,10 +1605,9 @@ def test_a_query_is_localized_again_as_upright_as_the_networks_of_the_run_saw_it
     files, session = finished[0], Capture.open(small_capture)["hl_query"]
     scene_map = replace(Map.open(files.run, files.scene, "ios"), escalation=[])
     if network == "embedder":
-        vars(scene_map.search)["embedders"] = [Learned(np.zeros(1, np.float32))]
+        scene_map.search.embedders = [Learned(np.zeros(1, np.float32))]
     if network == "reranker":
-        scene_map.reranked = True
-        vars(scene_map.search)["_verification"] = LocalMethod("superpoint", Mock(), Mock()), Mock()
+        scene_map.search.verification = LocalMethod("superpoint", Mock(), Mock()), Mock()
     monkeypatch.setattr(Map, "open", lambda *_: scene_map)
     shown: list[Any] = []
     monkeypatch.setattr(

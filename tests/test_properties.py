@@ -521,7 +521,7 @@ def test_a_known_similarity_is_found(
 # Search
 
 
-@given(data=st.data(), dimensions=st.integers(1, 4), backend=st.sampled_from(["faiss", "torch"]))
+@given(data=st.data(), dimensions=st.integers(1, 4), backend=st.sampled_from(["faiss", "torch", "numpy"]))
 def test_search_is_the_sorted_product_with_ties_by_index(data: st.DataObject, dimensions: int, backend: Any) -> None:
     def vectors(most: int) -> np.ndarray:
         shape = st.tuples(st.integers(0, most), st.just(dimensions))

@@ -217,15 +217,15 @@ def test_what_is_current_is_reused_and_a_killed_run_goes_on(
     before = reranked(files).read_bytes()
     assert run(small_capture, files)["skipped"].tolist() == [True]
     asked: list[int] = []
-    verify = verification.Verifier.verify
+    rank = verification.Verifier.rank
 
     def count(self: Any, *arguments: Any) -> Any:
         asked.append(1)
         if len(asked) == 3:
             raise KeyboardInterrupt
-        return verify(self, *arguments)
+        return rank(self, *arguments)
 
-    monkeypatch.setattr(verification.Verifier, "verify", count)
+    monkeypatch.setattr(verification.Verifier, "rank", count)
     sidecar_path(reranked(files)).unlink()
     with pytest.raises(KeyboardInterrupt):
         run(small_capture, files)
@@ -403,6 +403,6 @@ def test_map_images_in_memory_are_bounded(monkeypatch: pytest.MonkeyPatch) -> No
     store = Store(dict.fromkeys("abc", features))
     verifier = verification.Verifier(RerankSettings(max_features=4), MutualMatcher(0.8), store)
     for name in "ababcab":
-        verifier.verify(features, WIDE, [name], [WIDE])
+        verifier.rank(features, WIDE, [name], [WIDE])
     assert read == ["a", "b", "c", "a", "b"]
     assert len(verifier._map_features("a")) == 4

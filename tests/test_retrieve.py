@@ -12,10 +12,9 @@ import pandas as pd
 import pytest
 
 from tests.test_embed import HL_RIG
-from toolkit import retrieve as retrieve_stage
 from toolkit.capture import Capture
 from toolkit.embed import embed_sessions
-from toolkit.embedders import StoredVectors, Vectors
+from toolkit.embedders import StoredVectors, Vectors, masks
 from toolkit.embedders import search as search_module
 from toolkit.embedders.masks import Masks, near
 from toolkit.errors import ArtifactError, CaptureError, ManifestError
@@ -24,7 +23,7 @@ from toolkit.geometry import unit
 from toolkit.retrieve import load_embeddings, retrieve_pairs, search
 from toolkit.synthetic import render_capture
 
-BACKENDS = ["faiss", "torch"]
+BACKENDS = ["faiss", "torch", "numpy"]
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -367,7 +366,7 @@ def test_a_vector_that_is_not_finite_stops_its_own_pairs_alone(tiny: Path, tmp_p
 @pytest.fixture
 def short_window(monkeypatch: pytest.MonkeyPatch) -> None:
     """The tiny capture has an image each microsecond or ten."""
-    monkeypatch.setattr(retrieve_stage, "WINDOW_S", 4e-6)
+    monkeypatch.setattr(masks, "WINDOW_S", 4e-6)
 
 
 def write_wifi(capture: Path, session: str, walls: dict[int, int]) -> None:

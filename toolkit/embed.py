@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
-from toolkit.capture.images import default_workers, prefetch, read_image, turn_image
+from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.capture.upright import upright_turns
-from toolkit.embedders import WEIGHTS, Embedder, create_embedder, resolve_model, shows_upright
+from toolkit.embedders import WEIGHTS, resolve_model
+from toolkit.embedders.references import Describer
 from toolkit.errors import CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures, SiftExtractor
 from toolkit.features.stores import FeatureStore, extract_session
@@ -35,7 +36,7 @@ from toolkit.files import (
     write_sidecar,
     write_text,
 )
-from toolkit.geometry import Ints, unit
+from toolkit.geometry import Ints
 from toolkit.manifest import EmbedSettings
 from toolkit.models.weights import resolve_weights
 from toolkit.store.items import Items, items_beside, remove_items, retry_damaged
@@ -145,9 +146,11 @@ class _Model:
         ids = [id_ for id_ in ids if id_ in capture]
         parts, unreadable = self._subsessions(ids, subsession)
         (model,) = settings.models
-        options = {"vocabulary": self._vocabulary()} if model == "vlad" else settings.of_network
-        embedder = create_embedder(model, **options)
-        if shows_upright(embedder, settings.upright):
+        if model == "vlad":
+            self._learn_vocabulary()
+        describer = Describer.open(model, settings, out)
+        embedder = describer.embedder
+        if describer.upright:
             turns = upright_turns(capture, settings.world_up)
             parts = [replace(part, turns=turns.of(part.session, part.rows)) for part in parts]
         if subsession == "all":
@@ -182,7 +185,7 @@ class _Model:
                 source = fingerprint({**record, "rows_a_batch": settings.batch_size, "kept": done})
                 todo = [(f"{at:08d}", source, at) for at in range(-(-len(new.rows) // settings.batch_size))]
                 store = store_of(part.session.id) if embedder.inputs == "features" else None
-                arguments = embedder, new, settings, store
+                arguments = describer, new, store
                 with Items(items_beside(matrix_path), skip_existing=self.skip_existing) as batches:
                     left = batches.distribute(_embed_into, batches.left(todo), arguments, _label(part), "batch")
                     _embed_into(batches, left, *arguments)
@@ -264,7 +267,7 @@ class _Model:
             raise ManifestError(f"No images of subsession {subsession!r} in {', '.join(ids)}; known: {known}.")
         return selected, unreadable
 
-    def _vocabulary(self) -> Path:
+    def _learn_vocabulary(self) -> None:
         """Learn the VLAD vocabulary from the map images of all devices, unless the file is current.
 
         It stays while the map grows, up to `GROWTH`, so that what was embedded with it stays, too.
@@ -289,7 +292,7 @@ class _Model:
 
         record = record_of({name: len(part.rows) for name, part in maps.items()})
         if self._is_current(path, record):
-            return path
+            return
         old = ((self.skip_existing and read_sidecar(path)) or {}).get("maps", {})
         counts = {name: one["count"] for name, one in old.items()}
         grown = counts.keys() == maps.keys() and all(
@@ -297,7 +300,7 @@ class _Model:
         )
         enough = grown and sum(counts.values()) >= MAX_DIM  # else the dimension is the number of images
         if enough and self._is_current(path, record_of(counts)):
-            return path
+            return
         chosen: dict[str, list[int]] = {}
         for index in np.linspace(0, len(images) - 1, min(len(images), VOCABULARY_IMAGES)).astype(int).tolist():
             session, row = images[index]
@@ -315,7 +318,6 @@ class _Model:
         vlad = Vlad.learn(features, len(keys), self.settings.seed)
         vlad.save(path)
         write_sidecar(path, record)
-        return path
 
 
 def _remove_former(out_dir: Path, names: list[str], parts: list[_Subsession]) -> None:
@@ -337,13 +339,12 @@ def _label(part: _Subsession) -> str:
 def _embed_into(
     batches: Items,
     todo: Sequence[tuple[str, str, int]],
-    embedder: Embedder,
+    describer: Describer,
     part: _Subsession,
-    settings: EmbedSettings,
     store: FeatureStore | None,
 ) -> None:
     """Embed the batches `todo` (name, source, number); store their vectors and the reasons for unreadable images."""
-    size, session = settings.batch_size, part.session
+    size, session, embedder = describer.settings.batch_size, part.session, describer.embedder
     rows = [np.arange(len(part.rows))[number * size : (number + 1) * size] for *_, number in todo]
     left = np.concatenate([np.zeros(0, np.int64), *rows])
 
@@ -359,7 +360,7 @@ def _embed_into(
             image = read_image(session.image_path(row), min_side=embedder.min_side)
         except ImageError as error:
             return at, str(error)
-        return at, embedder.prepare(turn_image(image, int(part.turns[at])))
+        return at, describer.prepare(image, int(part.turns[at]))
 
     def stack(items: list[tuple[int, Any | str]]) -> tuple[Any, dict[int, str]]:
         readable = [item for _, item in items if not isinstance(item, str)]
@@ -373,11 +374,7 @@ def _embed_into(
     # Features are described in a thread a core; a network has its own threads.
     with bar, one_thread() if store is not None else nullcontext():
         for (name, source, _), (batch, unreadable) in zip(todo, stacked, strict=True):
-            vectors = embedder.embed(batch)
-            if vectors.shape != (len(batch), embedder.dim):
-                raise ValueError(f"{embedder.name} gave {vectors.shape}; expected {(len(batch), embedder.dim)}.")
-            if settings.normalize:
-                vectors = unit(vectors)
+            vectors = describer.describe(batch)
             batches.add(name, source, {VECTORS: vectors}, {"failed": list(unreadable.items())})
             bar.update(len(batch) + len(unreadable))
 

@@ -5,10 +5,9 @@ fit one essential matrix of the two calibrated cameras, so the right reference c
 """
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -199,28 +198,20 @@ class _Pair:
             return self._row(query, "no reference has local features")
         cameras = [self.map_session.camera(reference["sensor_id"]) for reference in references]
         camera = self.query_session.camera(query["sensor_id"])
-        counts = verifier.verify(query_store[name], camera, names, cameras)
-        if not any(counts[0]):
+        ranked = verifier.rank(query_store[name], camera, names, cameras)
+        if not ranked[0][1]:
             return self._row(query, "no reference agrees with the query by more than chance")
-        return self._row(query, "", zip(*counts, strict=True))
+        return self._row(query, "", ranked)
 
-    def _row(
-        self, query: dict[str, Any], reason: str, counts: Iterable[tuple[int, int]] = repeat((0, 0))
-    ) -> dict[str, Any]:
-        """Return a query image's row; `counts`: verified and all matches of each reference, which order them."""
-        references = [
-            {
-                **reference,
-                "score": verified,
-                "num_matches": matches,
-                "retrieval_score": reference["score"],
-                "retrieval_rank": reference["rank"],
-            }
-            for reference, (verified, matches) in zip(query["topk"][: self.settings.topn], counts, strict=False)
-        ]
-        references.sort(key=lambda row: (-row["score"], row["retrieval_rank"]))
-        ranked = [row | {"rank": rank} for rank, row in enumerate(references[: self.settings.topk], start=1)]
-        return query | {"topk": ranked, "reason": reason}
+    def _row(self, query: dict[str, Any], reason: str, ranked: Sequence[tuple[int, int, int]] = ()) -> dict[str, Any]:
+        """Return a query image's row; `ranked` as by `Verifier.rank`, empty: references keep their order."""
+        topk = list[dict[str, Any]]()
+        kept = [(index, 0, 0) for index in range(len(query["topk"]))][: self.settings.topk]
+        for index, verified, matches in ranked or kept:
+            reference = query["topk"][index]
+            before = {"retrieval_score": reference["score"], "retrieval_rank": reference["rank"]}
+            topk.append(reference | {"score": verified, "num_matches": matches, **before, "rank": len(topk) + 1})
+        return query | {"topk": topk, "reason": reason}
 
 
 def _counts(rows: list[dict[str, Any]]) -> dict[str, int]:

@@ -80,7 +80,7 @@ def test_known_answers() -> None:
     np.testing.assert_allclose(fuse(list(pairs)), reference(pairs), rtol=1e-12)
 
 
-@pytest.mark.parametrize("backend", ["faiss", "torch"])
+@pytest.mark.parametrize("backend", ["faiss", "torch", "numpy"])
 @pytest.mark.parametrize("block_bytes", [1 << 20, 4 * sum(DIMS) * 37])
 def test_search_is_the_sorted_fused_matrix(monkeypatch: pytest.MonkeyPatch, backend: Any, block_bytes: int) -> None:
     monkeypatch.setattr(search_module, "_BLOCK_BYTES", block_bytes)

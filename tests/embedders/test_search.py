@@ -17,6 +17,7 @@ from toolkit.embedders.masks import Masks
 from toolkit.embedders.search import load_index, make_index, search
 from toolkit.errors import ArtifactError, ManifestError, ToolkitError
 from toolkit.files import sidecar_path
+from toolkit.geometry import unit
 from toolkit.manifest import RetrieveSettings
 
 DIM = 64
@@ -222,3 +223,27 @@ def test_an_index_that_is_not_asked_for_loads_no_torch() -> None:
     code = "import sys, toolkit.retrieve, toolkit.scene.map; sys.exit('torch' in sys.modules)"
     root = Path(index_module.__file__).parents[2]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("dims", [(9,), (4, 300)], ids=["one descriptor", "two"])
+def test_a_single_image_finds_what_the_search_of_many_finds(tmp_path: Path, dims: tuple[int, ...]) -> None:
+    rng, count = np.random.default_rng(0), 40
+    parts = {}
+    for number, dim in enumerate(dims):
+        vectors = unit(rng.normal(size=(count, dim)).astype(np.float32))
+        vectors[7] = vectors[3]  # a tie
+        np.save(tmp_path / f"{number}.npy", vectors)
+        parts[str(number)] = StoredVectors((tmp_path / f"{number}.npy",), (0, count), dim, np.arange(count))
+    stored = Vectors(parts)
+    asked = np.vstack([rng.normal(size=(6, sum(dims))), np.zeros((1, sum(dims)))]).astype(np.float32)
+    for query in [*asked, stored[:][3]]:
+        for mask in (None, np.arange(count) % 3 == 0, np.zeros(count, bool)):
+            for k in (1, 11, 100):
+                expected = search(query[None], stored, k, allowed=mask, dims=dims)
+                masks = None if mask is None else Masks(count, np.packbits(mask[None], 1, "little"), np.zeros(1, int))
+                for allowed, vectors in ((mask, stored), (masks, stored[:])):
+                    found = search(query[None], vectors, k, "numpy", allowed=allowed, dims=dims)
+                    for one, other in zip(found, expected, strict=True):
+                        np.testing.assert_array_equal(one, other)
+    with pytest.raises(ValueError, match="NaN"):
+        search(np.full((1, sum(dims)), np.nan, np.float32), stored, 1, "numpy", dims=dims)

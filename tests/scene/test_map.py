@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,12 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.pose.test_local_triangulation import Scene
-from toolkit.capture import Session
-from toolkit.embedders import StoredVectors, Vectors
-from toolkit.embedders.search import search
 from toolkit.features.features import LocalFeatures
-from toolkit.files import SceneFiles
-from toolkit.geometry import unit
 from toolkit.manifest import LocalizeSettings
 from toolkit.pose.base import (
     CAMERA,
@@ -34,7 +29,7 @@ from toolkit.pose.base import (
     View,
 )
 from toolkit.scene.images import localize_images
-from toolkit.scene.map import Map, ReferenceSearch
+from toolkit.scene.map import Map
 from toolkit.scene.query import MapCameras, camera_key
 
 
@@ -263,27 +258,3 @@ def test_a_cropped_image_is_ok_only_if_the_matches_tell_its_principal_point(
         scene_map.cameras = MapCameras(session)
     (result,) = localize_images(scene_map, [tmp_path / "a.jpg"])  # type: ignore[arg-type]
     assert result.status_text == status
-
-
-@pytest.mark.parametrize("dims", [(9,), (4, 300)], ids=["one descriptor", "two"])
-def test_a_single_image_finds_what_the_search_of_many_finds(tmp_path: Path, dims: tuple[int, ...]) -> None:
-    rng, count = np.random.default_rng(0), 40
-    parts = {}
-    for number, dim in enumerate(dims):
-        vectors = unit(rng.normal(size=(count, dim)).astype(np.float32))
-        vectors[7] = vectors[3]  # a tie
-        np.save(tmp_path / f"{number}.npy", vectors)
-        parts[str(number)] = StoredVectors((tmp_path / f"{number}.npy",), (0, count), dim, np.arange(count))
-    stored, rows = Vectors(parts), rng.permutation(1000)[:count]
-    of_run = ReferenceSearch(SceneFiles(tmp_path, "none"), cast(Session, None), reranked=False)
-    vars(of_run).update(_stored=(stored, rows), _index=None)
-    queries = np.vstack([rng.normal(size=(6, sum(dims))), np.zeros((1, sum(dims)))]).astype(np.float32)
-    for query in [*queries, stored[:][3]]:
-        for allowed in (None, np.arange(count) % 3 == 0, np.zeros(count, bool)):
-            for k in (1, 11, 100):
-                scores, found = search(query[None], stored, k, allowed=allowed, dims=dims)
-                nearest, similarities = of_run._nearest(query, k, allowed)
-                np.testing.assert_array_equal(nearest, rows[found[found >= 0]])
-                np.testing.assert_array_equal(similarities, scores[found >= 0])
-    with pytest.raises(ValueError, match="NaN"):
-        of_run._nearest(np.full(sum(dims), np.nan, np.float32), 1, None)

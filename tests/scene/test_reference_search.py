@@ -11,10 +11,10 @@ from tests.unattended import no_kernels
 from toolkit import pipeline
 from toolkit.capture import Capture
 from toolkit.embedders import open_descriptors
+from toolkit.embedders.references import ReferenceSearch
 from toolkit.files import SceneFiles, image_name, read_references
 from toolkit.geometry import Floats, Ints
 from toolkit.pose.base import Query, View
-from toolkit.scene.map import ReferenceSearch
 from toolkit.threads import fixed_sums
 
 DEVICES = ("ios", "hl", "spot")
@@ -36,14 +36,14 @@ def searched(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> S
 @pytest.mark.parametrize("device", DEVICES)
 def test_an_open_map_searches_as_the_retrieve_stage(searched: SceneFiles, small_capture: Path, device: str) -> None:
     capture = Capture.open(small_capture)
-    search = ReferenceSearch(searched, capture["ios_map"], reranked=False)
-    vectors, table = open_descriptors(searched.embeddings, f"{device}_query", search.retrieve_settings.normalize)
+    search = ReferenceSearch(searched, capture, "ios", reranked=False)
+    vectors, table = open_descriptors(searched.embeddings, f"{device}_query", normalize=False)
     described = dict(zip(map(image_name, table["abs_path"]), vectors[:], strict=True))
     lines = read_references(searched.retrieval("ios", device), "path")
     assert len(lines) >= 2
     for line in lines:
         vector = described[image_name(str(line["path"]))]
-        rows, scores = search._nearest(vector, search.retrieve_settings.topk, None)
+        ((rows, scores),) = search.find(Query([], np.zeros((0, 4, 4)), descriptors=[vector[None]]))
         assert_references(search, line, rows, scores)
 
 
@@ -54,7 +54,7 @@ def test_an_open_map_finds_what_the_stages_found(
 ) -> None:
     """From the pixels of an image: its features and descriptors are computed again, and the scores are equal."""
     capture = Capture.open(small_capture)
-    session, search = capture[f"{device}_query"], ReferenceSearch(searched, capture["ios_map"], reranked)
+    session, search = capture[f"{device}_query"], ReferenceSearch(searched, capture, "ios", reranked)
     folder = searched.reranked_dir if reranked else searched.retrieval_dir
     lines = read_references(folder / searched.retrieval("ios", device).name, "path")
     for line in lines:

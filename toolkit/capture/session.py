@@ -695,11 +695,16 @@ class Capture:
         Raises:
             CaptureError: no session lists the image.
         """
-        session = self[session_id(name.partition("/")[0])]
-        row = session.row_of_name.get(name)
-        if row is None:
+        if (found := self.find_image(name)) is None:
+            session = self[session_id(name.partition("/")[0])]
             raise CaptureError(f"{session.path / 'images.txt'}: has no image {name!r}. Run its stages again.")
-        return session.image_path(row)
+        return found[0].image_path(found[1])
+
+    def find_image(self, name: str) -> tuple[Session, int] | None:
+        """Return the session of an image, and its row there, by its name; None if no session lists the image."""
+        of_image = session_id(name.partition("/")[0])
+        row = self[of_image].row_of_name.get(name) if of_image in self else None
+        return None if row is None else (self[of_image], row)
 
     def __getitem__(self, session_id: str) -> Session:
         if session_id not in self.session_ids:

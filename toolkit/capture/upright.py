@@ -12,6 +12,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pandas as pd
@@ -398,9 +399,15 @@ def quarter_turns(maps: Sequence[Session], world_up: ArrayLike | None = None) ->
     return Turns(up, {kind: _TurnsByName.learn(names[kind], up_in_cams, share) for kind, share in SHARES.items()})
 
 
-def upright_turns(capture: Capture, world_up: ArrayLike | None = None) -> Turns:
-    """Return the turns according to all map sessions of a capture; see `quarter_turns`."""
-    return quarter_turns(capture.usable("map"), world_up)
+_KEPT = WeakKeyDictionary[Capture, dict[str, Turns]]()
+
+
+def upright_turns(capture: Capture, world_up: Sequence[float] | None = None) -> Turns:
+    """Return the turns according to all map sessions of a capture, found once; see `quarter_turns`."""
+    kept, key = _KEPT.setdefault(capture, {}), str(world_up)
+    if key not in kept:
+        kept[key] = quarter_turns(capture.usable("map"), world_up)
+    return kept[key]
 
 
 def _from_rigs(session: Session, sensors: pd.Series, turns: Ints, ups: Floats) -> Ints:

@@ -81,11 +81,6 @@ def resolve_model(model: str | list[str], checkpoint: str | Path | None = None) 
     return resolve_name(model, checkpoint) if isinstance(model, str) else [resolve_name(n, checkpoint) for n in model]
 
 
-def shows_upright(embedder: Embedder, upright: bool | None) -> bool:
-    """Tell whether images are turned upright for an embedder; `upright` is the setting, None: as the embedder needs."""
-    return embedder.inputs == "images" and (embedder.upright if upright is None else upright)
-
-
 def create_embedder(name: str, **options: Any) -> Embedder:
     """Create an embedder.
 

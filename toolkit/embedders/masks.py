@@ -8,6 +8,8 @@ of all strengths is compared, because receivers of different devices differ by s
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,11 +19,25 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from toolkit.capture.session import Session
-from toolkit.capture.tables import Trajectory, as_strings, codes_of, times_of
+from toolkit.capture.session import SUBSESSIONS, Session
+from toolkit.capture.tables import SIGNALS, Trajectory, as_strings, codes_of, times_of
+from toolkit.errors import ManifestError
+from toolkit.files import file_fingerprint
 from toolkit.geometry import Floats, Ints
+from toolkit.manifest import MaskSettings
 
 Bools = NDArray[np.bool_]
+MAX_ANGLE_DEG = 90.0
+"""Largest angle between the viewing directions of a rough pose and a map camera, degrees; roll is ignored."""
+GPS_MARGIN_M = 25.0
+"""Largest distance between two GPS fixes, meters, beyond twice the sum of their stated accuracies."""
+RADIO_SHARE = 0.025
+"""Share of the map images that a radio mask keeps, as in the benchmark."""
+WINDOW_S = 2.0
+"""Largest time difference between an image and the radio scans and GPS fixes used for it, seconds."""
+_CHOICE = 3
+"""Map images that a radio mask leaves per reference, at least. Radio knows the place but not the viewing direction, so
+the descriptors must have some to choose from."""
 Images = tuple[Session, Ints]
 """Images of the map, N, or queries, Q: their session, and their rows in it."""
 
@@ -97,6 +113,54 @@ def combine(priors: Sequence[Masks]) -> tuple[Masks, list[int]]:
     return Masks(priors[0].count, bits, np.where(limited[which], which, -1)), without
 
 
+class Priors:
+    """The priors on the location of queries that the settings enable: rough poses, GPS, radio signals."""
+
+    def __init__(self, settings: MaskSettings) -> None:
+        """Raise ManifestError if the file of rough poses is missing, CaptureError if it is malformed."""
+        if settings.poses is not None and not Path(settings.poses).is_file():
+            expected = "Expected poses as in trajectories.txt."
+            raise ManifestError(f"retrieve.mask.poses: found no file {settings.poses}. {expected}")
+        self.settings = settings
+        self.poses = None if settings.poses is None else Trajectory.read(settings.poses)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the enabled priors, as settings have them."""
+        return [name for name in ("poses", "gps", "radio") if getattr(self.settings, name)]
+
+    def masks(self, map_images: Images, query_images: Images, topk: int) -> tuple[Masks | None, dict[str, int]]:
+        """Return the map images that each query image may find as one of `topk` references, None: all; and by the name
+        of each prior the number of query images that it leaves the whole map.
+        """
+        images, priors = (map_images, query_images), dict[str, Masks]()
+        if self.poses is not None:
+            priors["poses"] = pose_masks(self.poses, *images, self.settings.poses_distance, MAX_ANGLE_DEG)
+        if self.settings.gps:
+            priors["gps"] = gps_masks(*images, GPS_MARGIN_M, WINDOW_S)
+        if self.settings.radio:
+            least = max(_CHOICE * topk, int(np.ceil(RADIO_SHARE * len(map_images[1]))))
+            priors["radio"] = radio_masks(*images, least, WINDOW_S)
+        if not priors:
+            return None, {}
+        masks, counts = combine(list(priors.values()))
+        return masks, dict(zip(priors, counts, strict=True))
+
+    def record(self, *sessions: Session) -> dict[str, Any]:
+        """Return the settings and fingerprints of the files that masks depend on; empty without priors."""
+        settings, record, names = self.settings, dict[str, Any](), list[str]()
+        if settings.poses:
+            record["poses"] = [file_fingerprint(settings.poses), settings.poses_distance, MAX_ANGLE_DEG]
+        if settings.gps:
+            record["gps"], names = [GPS_MARGIN_M, WINDOW_S], ["gps.txt"]
+        if settings.radio:
+            record["radio"], names = [RADIO_SHARE, WINDOW_S], [*names, *SIGNALS]
+        if names:
+            paths = [session.path / name for session in sessions for name in (*names, SUBSESSIONS)]
+            record["files"] = [file_fingerprint(path) if path.exists() else None for path in paths]
+        return {"mask": record} if record else {}
+
+
 def near(world_from_cams: Floats, world_from_cam: Floats, distance: float, angle_deg: float = 180.0) -> Bools:
     """Return which of N map cameras may see the same scene as a camera at a roughly known pose, (N,) bool.
 
@@ -122,7 +186,12 @@ def pose_masks(poses: Trajectory, map_images: Images, query_images: Images, dist
     times, sensors = times_of(session.images)[rows], session.images["sensor_id"].iloc[rows]
     of_rig = poses.lookup(times, session.device_ids[rows]) @ session.rig_from_cam(rows)
     world_from_cams = np.where(np.isnan(of_rig[:, :1, :1]), poses.lookup(times, sensors), of_rig)
-    which = np.where(np.isnan(world_from_cams[:, 0, 0]), -1, np.arange(len(rows)))
+    return near_masks(map_images, world_from_cams, distance, angle_deg)
+
+
+def near_masks(map_images: Images, world_from_cams: Floats, distance: float, angle_deg: float) -> Masks:
+    """Return masks of the map images that are `near` the poses (Q, 4, 4) of query images; NaN is not known."""
+    which = np.where(np.isnan(world_from_cams[:, 0, 0]), -1, np.arange(len(world_from_cams)))
     of_map = map_images[0].world_from_cam(map_images[1])
     masks = (near(of_map, pose, distance, angle_deg)[None] for pose in world_from_cams)
     return Masks.of(masks, which, len(of_map))

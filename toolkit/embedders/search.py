@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import faiss as typed_faiss
 import numpy as np
@@ -43,7 +43,7 @@ EXACT = "Flat"  # factory string of the exact search, which needs no index
 _TRAIN_BYTES = 1 << 30  # training vectors of an index, at most, bytes of float32
 _TRAIN_PER_UNIT = 64  # training vectors per PCA dimension and per cell of an inverted file, if the map has as many
 _TRAIN_CODES = 1 << 16  # training vectors of the codes, at least, however few cells there are; PQ needs 256 or more
-Backend = Literal["faiss", "torch"]
+Backend = Literal["faiss", "torch", "numpy"]
 _BLOCK_BYTES = 128 << 20  # vectors read or added to an index at a time, bytes of float32: bounds the memory
 _QUERY_BYTES = 512 << 20  # queries compared in one pass over the database, bytes of float32
 # Database rows read at a time for queries with masks. Masks select parts of recordings, so a small block has no allowed
@@ -145,11 +145,14 @@ def embedder_fingerprint(settings: Mapping[Any, Any]) -> str:
 
 
 def require_same_embedder(vectors: Vectors, others: Vectors) -> None:
-    """Raise ArtifactError if two sets of vectors are known to come from different embedders or vocabularies."""
+    """Raise ArtifactError if two sets of vectors are known to come from different embedders or vocabularies, or have
+    different dimensions.
+    """
     for ours, theirs in zip(vectors.parts.values(), others.parts.values(), strict=True):
-        if ours.embedder and theirs.embedder and ours.embedder != theirs.embedder:
-            files = f"{ours.paths[0]} and {theirs.paths[0]} were made by different embedders or vocabularies"
-            raise ArtifactError(f"{files}, so their vectors cannot be compared. Embed all sessions again.")
+        if ours.dim != theirs.dim or (ours.embedder and theirs.embedder and ours.embedder != theirs.embedder):
+            fault = f"were made by different models or vocabularies ({ours.dim} and {theirs.dim} dimensions)"
+            do = "so their vectors cannot be compared. Embed all sessions again."
+            raise ArtifactError(f"{ours.paths[0]} and {theirs.paths[0]} {fault}, {do}")
 
 
 def matrix_fingerprints(paths: Sequence[Path]) -> list[Any]:
@@ -205,8 +208,6 @@ def open_embeddings(folder: str | Path) -> tuple[Vectors, pd.DataFrame]:
             fault = f"{found} does not fit {path.name} {matrix.shape}"
             raise ArtifactError(f"{fault}; expected {', '.join(MANIFEST_COLUMNS)}, one row per vector. Embed again.")
         count, dim = matrix.shape
-        if parts and (dim,) != parts[0].dims:
-            raise ArtifactError(f"{path} has {dim} dimensions, {manifests[0].parent} {parts[0].dims[0]}; embed again.")
         match read_json(sidecar_path(path)):
             case {"settings": {"embedder": {**settings}}}:
                 embedder = embedder_fingerprint(settings)
@@ -461,14 +462,14 @@ def search(
     Args:
         query, database: (Q, D) and (N, D), any float type; `Vectors` and memory-mapped arrays stay on disk.
         k: neighbors per query; at most N are returned.
-        backend: `faiss` or `torch`.
+        backend: `faiss`, `torch` or, for few queries, `numpy`, which loads neither of them.
         compute_device: where torch computes: `auto`, `cpu`, `cuda`, `cuda:<i>`, `mps`.
         faiss_gpu: let faiss compute on the GPU (needs a faiss built for it).
         index: index of the database; it replaces the backend in finding candidates, and may miss neighbors.
         allowed: (N,) rows of the database that may be returned, or a mask per query; None: all. With a mask per query
             and no index, torch computes in place of faiss.
         dims: number of columns of each descriptor, in order, if a row holds several side by side. Their similarities
-            are fused by torch, whatever the backend, see `fuse`. Empty: one descriptor.
+            are fused, by torch in place of faiss, see `fuse`. Empty: one descriptor.
 
     Returns:
         Scores (Q, K) float32 and rows (Q, K) int64, K = min(k, N); -inf and -1 if fewer rows are allowed, or the index
@@ -655,8 +656,10 @@ def _backend(
     query: _Floats, masks: Masks | None, backend: Backend, compute_device: str, faiss_gpu: bool, dims: Sequence[int]
 ) -> _Best:
     """Return the function that searches a block of the database for the queries."""
-    if backend not in ("faiss", "torch"):
-        raise ValueError(f"Unknown backend {backend!r}; expected faiss or torch.")
+    if backend not in get_args(Backend):
+        raise ValueError(f"Unknown backend {backend!r}; expected {', '.join(get_args(Backend))}.")
+    if backend == "numpy":
+        return partial(_best_by_numpy, query, masks, dims)
     if backend == "torch" or len(dims) > 1 or masks is not None:
         return _torch_backend(query, masks, compute_device, dims)
     if not faiss_gpu:
@@ -665,6 +668,16 @@ def _backend(
         raise ToolkitError("faiss_gpu is set, but the installed faiss has no GPU support. Set faiss_gpu: false.")
     gpu = faiss.StandardGpuResources()
     return lambda block, _, number: faiss.knn_gpu(gpu, query, block, number, metric=faiss.METRIC_INNER_PRODUCT)
+
+
+def _best_by_numpy(
+    query: _Floats, masks: Masks | None, dims: Sequence[int], block: _Floats, start: int, number: int
+) -> Found:
+    scores = fused_products(query, block, dims, lambda a, b: a @ b.T)
+    if masks is not None:
+        scores = np.where(masks.rows(start, start + len(block)), scores, -np.inf)
+    rows = np.argsort(-scores, axis=1, kind="stable")[:, :number]
+    return np.take_along_axis(scores, rows, 1), rows
 
 
 def _torch_backend(query: _Floats, masks: Masks | None, compute_device: str, dims: Sequence[int]) -> _Best:

@@ -307,24 +307,26 @@ class Verifier:
         self._map_features = lru_cache(MAP_IMAGES_KEPT)(lambda name: self._strongest(store[name]))
 
     @fixed_sums
-    def verify(
+    def rank(
         self,
         features: LocalFeatures,
         camera: pycolmap.Camera,
         references: Sequence[str],
         cameras: Sequence[pycolmap.Camera],
-    ) -> tuple[list[int], list[int]]:
-        """Return the numbers of verified and of all matches of a query image with map images; 0 without features."""
-        features, counts = self._strongest(features), np.zeros((2, len(references)), np.int64)
-        readable = [index for index, name in enumerate(references) if name in self.store]
+    ) -> list[tuple[int, int, int]]:
+        """Return those of the first `topn` map images with most verified matches, at most `topk`, best first: for each,
+        its index and its numbers of verified and of all matches, 0 without features. Equal ones keep their order.
+        """
+        features, counts = self._strongest(features), np.zeros((2, len(references[: self.settings.topn])), np.int64)
+        readable = [index for index, name in enumerate(references[: self.settings.topn]) if name in self.store]
         map_features = [self._map_features(references[index]) for index in readable]
         all_matches = self.matcher.match([(features, reference) for reference in map_features])
         for matches, reference, index in zip(all_matches, map_features, readable, strict=True):
             pixels, in_map = features.keypoints[matches.indices[:, 0]], reference.keypoints[matches.indices[:, 1]]
             pair = camera, pixels, cameras[index], in_map, matches.scores
             counts[:, index] = verified_matches(*pair, self.settings, tests=len(readable)).distinct, len(matches)
-        verified, matched = counts.tolist()
-        return verified, matched
+        order = np.argsort(-counts[0], kind="stable")[: self.settings.topk]
+        return [(index, *counts[:, index].tolist()) for index in order.tolist()]
 
     def _strongest(self, features: LocalFeatures) -> LocalFeatures:
         return features.take(slice(self.settings.max_features))

@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from toolkit.capture import Capture, Session
-from toolkit.embedders import open_descriptors
+from toolkit.embedders.references import Embedded
 from toolkit.errors import ArtifactError
 from toolkit.figures.query_images import draw_image, query_and_references, shown_name
 from toolkit.figures.style import (
@@ -137,21 +137,17 @@ class RetrievedPair:
         """Return the rows of posed map images in order, all `references` among them, and the query's similarities."""
         from toolkit.embedders.search import fused_products  # loads FAISS
 
-        session, row_of_name = self.map_session, self.map_session.row_of_name
-        queries, query_table = open_descriptors(self.embeddings, self.session.id, normalize=True)
-        vectors, table = open_descriptors(self.embeddings, session.id, normalize=True)
-        query_rows = np.flatnonzero(query_table["abs_path"].map(image_name) == self.session.image_name(row))
+        session, queries = self.map_session, Embedded.open(self.session, self.embeddings, normalize=True)
+        query_rows = np.flatnonzero(queries.rows == row)
         if not len(query_rows):
             raise ArtifactError(f"{self.embeddings}: {self.session.image_name(row)} has no descriptor. Embed again.")
-        rows = np.array([row_of_name.get(image_name(path), -1) for path in table["abs_path"]], np.int64)
-        usable = np.flatnonzero(rows >= 0)
-        usable = usable[is_posed(session.world_from_cam(rows[usable]))]
-        images = session.images.iloc[rows[usable]]
-        taken = images["timestamp"], images["sensor_id"].astype(str), session.subsession_of(rows[usable])
-        usable = usable[np.lexsort(taken)]
+        of_map = Embedded.of_map(session, self.embeddings, normalize=True)
+        rows, vectors = of_map.rows, of_map.vectors
+        images = session.images.iloc[rows]
+        usable = np.lexsort((images["timestamp"], images["sensor_id"].astype(str), session.subsession_of(rows)))
         sampled = np.arange(len(usable)) % max(1, -(-len(usable) // MAX_COMPARED)) == 0
         usable = usable[sampled | np.isin(rows[usable], references)]
-        ascending, (query,) = np.sort(usable), queries[query_rows[:1]]
+        ascending, (query,) = np.sort(usable), queries.vectors[query_rows[:1]]
         values = fused_products(query, vectors[ascending], vectors.dims, lambda a, b: b @ a).astype(np.float64)
         return rows[usable], values[np.searchsorted(ascending, usable)]
 

@@ -34,4 +34,5 @@ from toolkit.manifest.settings import (
     describe,
     nearest,
     require_known,
+    unreadable,
 )

@@ -4,6 +4,7 @@
 """
 
 import difflib
+import json
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -13,7 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from toolkit.errors import ManifestError
+from toolkit.errors import ArtifactError, ManifestError
 from toolkit.models.compute import DEVICE_NAME
 
 _BRANCH = r"literal|int$|str$|list\[|dict\[|constrained"
@@ -172,6 +173,14 @@ class Settings(BaseModel):
         except ValidationError as error:
             raise ManifestError(explain(error, cls, cls.__name__)) from None
 
+    @classmethod
+    def read(cls, folder: Path) -> Self:
+        """Return the settings beside a stage's results; raise ArtifactError if missing or of another version."""
+        try:
+            return cls.of(json.loads((folder / "settings.json").read_text(encoding="utf-8")))
+        except (OSError, ValueError, ManifestError) as error:
+            raise unreadable(folder / "settings.json", error) from None
+
     def given(self) -> dict[str, Any]:
         """Return the explicitly set fields as plain values; fields left at their defaults are absent."""
         return self.model_dump(mode="json", exclude_unset=True)
@@ -184,6 +193,13 @@ class Settings(BaseModel):
             short = getattr(value, "shorthand", "")
             rows |= {name if key in ("", short) else f"{name}.{key}": inner for key, inner in nested.items()}
         return rows
+
+
+def unreadable(path: Path, error: Exception) -> ArtifactError:
+    """Return the error for a file whose settings are missing or of another version, given what reading them raised."""
+    other = "another version of the toolkit wrote it"
+    problem = other if isinstance(error, ManifestError) else f"cannot read its settings ({error})"
+    return ArtifactError(f"{path}: {problem}. Run its stage again.")
 
 
 def expand(model: type[Settings], raw: Mapping[str, Any]) -> dict[str, Any]:
@@ -299,7 +315,7 @@ class MaskSettings(Settings):
     prior without information, or one that contradicts those before it, is ignored.
     """
 
-    constants = {"retrieve.py": "poses_angle_deg=MAX_ANGLE_DEG gps_margin_m radio_share window_s"}
+    constants = {"embedders/masks.py": "poses_angle_deg=MAX_ANGLE_DEG gps_margin_m radio_share window_s"}
     poses: str | None = None
     """File with rough poses of the query devices in the map's frame, in the format of trajectories.txt; restricts the
     search to map images near these poses. null: no such prior."""

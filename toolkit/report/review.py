@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import pandas as pd
 
@@ -13,10 +13,11 @@ from toolkit.errors import ArtifactError
 from toolkit.figures.evaluation import wilson_interval
 from toolkit.figures.style import percent
 from toolkit.files import SceneFiles, map_record_path, read_map_record, write_csv, write_text
-from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings
+from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings, Settings
 from toolkit.pose.base import status_counts
-from toolkit.results.pair import AnySettings, load_maps, map_files, pairs_of, read_settings
+from toolkit.results.pair import load_maps, map_files, pairs_of
 
+AnySettings = TypeVar("AnySettings", bound=Settings)
 PAIR = ["map_device", "query_device"]
 COUNTS = ["queries", "ok", "low_confidence", "failed"]
 NAMES = {
@@ -185,7 +186,7 @@ def _localization(settings: LocalizeSettings) -> list[str]:
 def _settings(folder: Path | None, model: type[AnySettings]) -> AnySettings | None:
     """Return the settings that a stage wrote beside its results; None without results."""
     try:
-        return read_settings(folder / "settings.json", model) if folder else None
+        return model.read(folder) if folder else None
     except ArtifactError:
         return None
 

@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import h5py
 import numpy as np
@@ -21,7 +21,7 @@ import pandas as pd
 
 from toolkit.capture import Capture, Session, Trajectory
 from toolkit.capture.tables import POSES_UNIT, read_query_table
-from toolkit.errors import COMMAND, ArtifactError, CaptureError, DamagedError, ManifestError, ToolkitError, first_line
+from toolkit.errors import COMMAND, ArtifactError, CaptureError, DamagedError, ToolkitError, first_line
 from toolkit.features.matching import LocalMethod
 from toolkit.features.stores import FeatureStore
 from toolkit.files import (
@@ -39,7 +39,7 @@ from toolkit.files import (
     write_atomic,
 )  # fmt: skip
 from toolkit.geometry import Floats
-from toolkit.manifest import LocalizeSettings, Settings, nearest
+from toolkit.manifest import LocalizeSettings, nearest, unreadable
 from toolkit.mapping.local_map import LocalMap, map_path
 from toolkit.pose.base import QueryResult, Status, split_status
 from toolkit.results.metrics import is_posed, length_unit, named_by_unit, pose_errors
@@ -54,7 +54,6 @@ and the folder of the references."""
 _FIRST = f"Localize first: {COMMAND} run MANIFEST, or build the map alone: add --only map."
 Localized = tuple[LocalizeSettings, dict[str, Any], list[str]]
 """Settings that a pair was localized with, attributes of its `.h5` file, and the file names of its maps."""
-AnySettings = TypeVar("AnySettings", bound=Settings)
 
 
 def query_group(timestamp: int, device_id: str) -> str:
@@ -342,12 +341,6 @@ def opened_by(files: SceneFiles) -> dict[str, list[Path]]:
     return found
 
 
-def _unreadable(path: Path, error: Exception) -> ArtifactError:
-    other = "another version of the toolkit wrote it"
-    problem = other if isinstance(error, ManifestError) else f"cannot read its settings ({error})"
-    return ArtifactError(f"{path}: {problem}. Run its stage again.")
-
-
 def how_localized(pair: Path) -> Localized:
     """Return how the queries of `poses/<pair>.h5` were localized; raise ArtifactError if the file does not say it."""
     try:
@@ -355,7 +348,7 @@ def how_localized(pair: Path) -> Localized:
             attributes = dict(file.attrs)
         return LocalizeSettings.of(json.loads(attributes[SETTINGS])), attributes, json.loads(attributes[MAPS])
     except (*HDF5_ERRORS, ToolkitError) as error:
-        raise _unreadable(pair, error) from None
+        raise unreadable(pair, error) from None
 
 
 def last_localized(files: SceneFiles, pairs: Sequence[Path]) -> Localized:
@@ -365,7 +358,7 @@ def last_localized(files: SceneFiles, pairs: Sequence[Path]) -> Localized:
     """
     last, localized, errors = None, list[Localized](), list[ArtifactError]()
     with suppress(ArtifactError):  # the run is of a version that wrote no such file, or other settings
-        last = read_settings(files.poses_dir / "settings.json", LocalizeSettings)
+        last = LocalizeSettings.read(files.poses_dir)
     for pair in pairs:
         try:
             localized.append(how_localized(pair))
@@ -374,14 +367,6 @@ def last_localized(files: SceneFiles, pairs: Sequence[Path]) -> Localized:
     if not localized:
         raise errors[-1]
     return next((one for one in localized if one[0] == last), localized[-1])
-
-
-def read_settings(path: Path, model: type[AnySettings]) -> AnySettings:
-    """Return the settings beside a stage's results; raise ArtifactError if missing or of another version."""
-    try:
-        return model.of(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, ManifestError) as error:
-        raise _unreadable(path, error) from None
 
 
 SESSION_FILES = "sensors.txt", "images.txt", "rigs.txt", "trajectories.txt"

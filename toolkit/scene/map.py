@@ -15,27 +15,25 @@ from numpy.typing import NDArray
 
 from toolkit import geometry
 from toolkit.capture import Capture, Session
-from toolkit.capture.images import camera_text, thumbnails, turn_image
+from toolkit.capture.images import camera_text, thumbnails
 from toolkit.capture.session import RECONSTRUCTION_RECORD
 from toolkit.capture.upright import Turns, upright_turns
-from toolkit.embedders import Embedder, Vectors, create_embedder, embedding_folders, open_descriptors, shows_upright
+from toolkit.embedders.masks import Masks, near_masks
 from toolkit.embedders.masks import near as within
-from toolkit.embedders.search import VectorIndex, embedder_fingerprint, load_index, search
+from toolkit.embedders.references import ReferenceSearch
 from toolkit.errors import ArtifactError
-from toolkit.features.features import KINDS, SiftExtractor, usable
+from toolkit.features.features import KINDS
 from toolkit.features.matching import (
     AnyMethod,
     DeferredMethod,
     LocalMethod,
-    Verifier,
-    create_local_methods,
     create_methods,
     needs_upright,
 )
 from toolkit.features.stores import FeatureStore, OnDemandFeatures, extract_session
-from toolkit.files import RAW_DATA, SceneFiles, image_name, map_record_path, read_json, require_current
-from toolkit.geometry import Floats, Ints, unit
-from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings
+from toolkit.files import RAW_DATA, SceneFiles, map_record_path, read_json, require_current
+from toolkit.geometry import Floats, Ints
+from toolkit.manifest import LocalizeSettings
 from toolkit.mapping.build import build_map
 from toolkit.mapping.local_map import Consistency, LocalMap, map_path
 from toolkit.mapping.pose_consistency import NOMINAL_DEPTH, remarks
@@ -74,7 +72,6 @@ from toolkit.results.pair import (
     last_localized,
     map_inputs,
     pairs_in_map,
-    read_settings,
 )  # fmt: skip
 from toolkit.scene.query import MapCameras, answer_of, query_from, show_matches, what_if, with_changes
 from toolkit.threads import fixed_sums
@@ -97,10 +94,6 @@ FEW_REFERENCES = 4
 """How many references, those that support an `ok` pose most, fallback features are matched with at first."""
 MAX_KNOWN = 3
 """Largest number of earlier poses of a query that the fallback features judge, too."""
-MAX_IN_MEMORY = 1 << 29
-"""Largest size in bytes of global descriptors (float32) that an open map keeps in memory; larger ones stay on disk."""
-Ranked = tuple[NDArray[np.int64], NDArray[np.float64]]
-"""Rows (k,) of map images in their session, best first, and their scores (k,)."""
 
 
 @dataclass
@@ -254,15 +247,14 @@ class Map:
             query: described here if it is not.
             k: number of references; None: as many as in the run.
             near: a rough pose of the query. Its references then look the same way from nearby, if there are any.
+                Without it, the run's priors (`retrieve.mask`) limit those of images of a session; others have none.
 
         Raises:
             ArtifactError: the map was not opened from a run, or was embedded by another embedder.
         """
         query = self.describe(query)
-        references, allowed = Retrieved(self, query), list[NDArray[np.bool_] | None]()
-        if near is not None:
-            allowed = [self._may_show(pose, near) for pose in near.world_from_rig @ query.rig_from_cams]
-        for rows, scores in self.search.find(query, k, allowed):
+        references = Retrieved(self, query)
+        for rows, scores in self.search.find(query, k, None if near is None else self._near(query, near)):
             indices = np.array([self.index_of.get(self.session.image_names[row], -1) for row in rows], np.int64)
             references.append(References(indices[indices >= 0], scores[indices >= 0]))
         return references
@@ -461,15 +453,11 @@ class Map:
         position_std = near.position_std / self.length  # the depth that it is compared with is in map lengths
         return Prior.about(near.world_from_rig, images, near.rotation_std_deg, position_std, "near")
 
-    def _may_show(self, world_from_cam: Floats, near: RoughPose) -> NDArray[np.bool_] | None:
-        """Return which searched map images (N,) may show what a camera at a rough pose sees; None if none may."""
-        mask = within(
-            self.session.world_from_cam(self.search.rows),
-            world_from_cam,
-            NEAR * self.length + 3 * near.position_std,
-            NEAR_DEG + 3 * near.rotation_std_deg,
-        )
-        return mask if mask.any() else None
+    def _near(self, query: Query, near: RoughPose) -> Masks:
+        """Return which searched map images may show what the images of a query at a rough pose see."""
+        limits = NEAR * self.length + 3 * near.position_std, NEAR_DEG + 3 * near.rotation_std_deg
+        of_map = self.session, self.search.images.rows
+        return near_masks(of_map, near.world_from_rig @ query.rig_from_cams, *limits)
 
     def _images_near(self, world_from_rig: Floats) -> Ints:
         """Return the map images, by index, that may show what a rig at a pose (4, 4) sees."""
@@ -562,7 +550,7 @@ class Map:
     changed = with_changes
 
     @cached_property
-    def search(self) -> "ReferenceSearch":
+    def search(self) -> ReferenceSearch:
         """The embedders and descriptors of the run.
 
         Raises:
@@ -570,12 +558,12 @@ class Map:
         """
         if self.files is None:
             raise ArtifactError("This map was not opened from a run, so its embedder is unknown. Use Map.open.")
-        return ReferenceSearch(self.files, self.session, self.reranked)
+        return ReferenceSearch(self.files, self.capture, self.device, self.reranked)
 
     def load(self) -> None:
         """Load what all queries share, before several threads find it missing: `cached_property` has no lock."""
         _ = self.localizer, self.index_of, self.fallback, self.session.image_names
-        self.search.load()
+        _ = self.search
         for kind in self.escalation:
             _ = kind.extractor
 
@@ -724,153 +712,3 @@ class Located:
     def what_if(self) -> Callable[..., "Comparison"]:
         """See `scene.query.what_if`; the first three arguments are given."""
         return partial(what_if, *self._opened)
-
-
-class ReferenceSearch:
-    """The embedders of a finished run, and the descriptors of its map images."""
-
-    def __init__(self, files: SceneFiles, session: Session, reranked: bool) -> None:
-        """Take the files of the run, the map session, and whether the run localized with reranked references."""
-        self.files, self.session, self.reranked = files, session, reranked
-
-    def load(self) -> None:
-        """Load what all queries share, before several threads find it missing: `cached_property` has no lock."""
-        _ = self.embedders, self._descriptors, self._index
-        if self.reranked:
-            _ = self._verification
-
-    @property
-    def shows_upright(self) -> bool:
-        """Whether the run turned images upright for an embedder, or for the features that it reranked with."""
-        upright = any(shows_upright(embedder, self.embed_settings.upright) for embedder in self.embedders)
-        return upright or (self.reranked and KINDS[self._verification[0].name].upright)
-
-    def describe(self, query: Query, kinds: Sequence[LocalMethod]) -> list[NDArray[np.float32]]:
-        """Return for each embedder the global descriptors (C, D) of a query's images; `kinds` are its features."""
-        return [embedder.embed(self._inputs(embedder, query, kinds)) for embedder in self.embedders]
-
-    def _inputs(self, embedder: Embedder, query: Query, kinds: Sequence[LocalMethod]) -> list[Any]:
-        if embedder.inputs != "features":
-            turned, side = shows_upright(embedder, self.embed_settings.upright), embedder.min_side
-            images = (turn_image(view.read(True, side), view.turns if turned else 0) for view in query.views)
-            return [embedder.prepare(image) for image in images]
-        sift, settings = self._sift, [kind.extractor.settings for kind in kinds]
-        if query.features and sift.settings in settings:  # the embedder can use the features of the localizer
-            at = settings.index(sift.settings)
-            return [features[at] for features in query.features if not isinstance(features, str)]
-        extracted = sift.extract([view.read(color=False) for view in query.views])
-        views = zip(extracted, query.views, strict=True)
-        return [usable(features, view.mask, view.camera) for features, view in views]
-
-    @cached_property
-    def _sift(self) -> SiftExtractor:
-        return SiftExtractor()
-
-    def find(
-        self, query: Query, k: int | None = None, allowed: Sequence[NDArray[np.bool_] | None] = ()
-    ) -> list[Ranked]:
-        """Return the references of each image of a query with the descriptors of `describe`, as the run would find
-        them.
-
-        By default, there are `k` as in the run; `allowed` has, for each image, a mask over the rows `rows`, or None.
-        Raise ArtifactError if the map was embedded by another embedder.
-        """
-        for embedder, described, dim in zip(self.embedders, query.descriptors, self._stored[0].dims, strict=True):
-            if described.shape[1] != dim:
-                found, expected = f"map descriptors of {dim} dimensions", f"{described.shape[1]} of {embedder.name}"
-                raise ArtifactError.at(self.files.embeddings, found, expected, "Run the embed stage again.")
-        searched = np.hstack([self._as_searched(vectors) for vectors in query.descriptors])
-        topk = self.retrieve_settings.topk if k is None or self.reranked else k
-        masks = list(allowed) or [None] * len(searched)
-        ranked = [self._nearest(vector, topk, mask) for vector, mask in zip(searched, masks, strict=True)]
-        if self.reranked:
-            ranked = [self._rerank(of_image, view) for of_image, view in zip(ranked, query.views, strict=True)]
-        return [(of_image[:k], scores[:k]) for of_image, scores in ranked]
-
-    def _nearest(self, vector: NDArray[np.float32], k: int, allowed: NDArray[np.bool_] | None) -> Ranked:
-        """Return the k map images that are most similar to a vector, with the scores and in the order of `search`."""
-        of_map, dims = self._descriptors, self._stored[0].dims
-        if self._index is not None or isinstance(of_map, Vectors) or len(dims) > 1:
-            found = search(vector[None], of_map, k, index=self._index, allowed=allowed, dims=dims)
-            scores, nearest = (of_vector[0, found[1][0] >= 0] for of_vector in found)
-            return self.rows[nearest], scores.astype(np.float64)
-        scores = np.einsum("nd,d->n", of_map, vector.astype(np.float64)).astype(np.float32)  # without FAISS and torch
-        if not np.isfinite(scores).all():
-            raise ValueError("The descriptors of the query or of the map have NaN or infinite values.")
-        candidates = np.arange(len(of_map)) if allowed is None else np.flatnonzero(allowed)
-        nearest = candidates[np.argsort(-scores[candidates], kind="stable")[:k]]
-        return self.rows[nearest], scores[nearest].astype(np.float64)
-
-    def _rerank(self, ranked: Ranked, view: View) -> Ranked:
-        """Return rows of map images and their numbers of verified matches, most first, as the rerank stage does."""
-        method, verifier = self._verification
-        rows = ranked[0][: verifier.settings.topn]
-        names = [self.session.image_name(int(row)) for row in rows]
-        verified, _ = verifier.verify(view.extract(method), view.camera, names, self.session.cameras(rows))
-        order = np.argsort(-np.array(verified), kind="stable")[: verifier.settings.topk]
-        return rows[order], np.array(verified, np.float64)[order]
-
-    def _as_searched(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return descriptors normalized and rounded like those of the map, which were written to a file."""
-        if self.embed_settings.normalize:
-            vectors = unit(vectors)
-        vectors = vectors.astype(self.embed_settings.dtype).astype(np.float32)
-        return unit(vectors) if self.retrieve_settings.normalize else vectors
-
-    @property
-    def rows(self) -> NDArray[np.int64]:
-        """Rows (N,) of the map images that are searched, in the session."""
-        return self._stored[1]
-
-    @cached_property
-    def embed_settings(self) -> EmbedSettings:
-        return read_settings(self.files.embeddings / "settings.json", EmbedSettings)
-
-    @cached_property
-    def retrieve_settings(self) -> RetrieveSettings:
-        return read_settings(self.files.retrieval_dir / "settings.json", RetrieveSettings)
-
-    @cached_property
-    def embedders(self) -> list[Embedder]:
-        """The embedders that the run used; ArtifactError is raised if the map's vectors are from another one."""
-        settings = self.embed_settings
-        folders = embedding_folders(self.files.embeddings).values()
-        embedders = [
-            create_embedder(name, **({"vocabulary": folder / "vlad.npz"} if name == "vlad" else settings.of_network))
-            for name, folder in zip(settings.models, folders, strict=True)
-        ]
-        for embedder, vectors in zip(embedders, self._stored[0].parts.values(), strict=True):
-            if vectors.embedder not in ("", embedder_fingerprint(embedder.settings)):
-                fault = f"was made by another embedder or vocabulary than the run's {embedder.name} of now"
-                raise ArtifactError(f"{vectors.paths[0]} {fault}. Run the embed stage again.")
-        return embedders
-
-    @cached_property
-    def _stored(self) -> tuple[Vectors, NDArray[np.int64]]:
-        """Global descriptors (N, D) of the posed map images, on disk, as they are searched; rows of the images (N,)."""
-        normalize = self.retrieve_settings.normalize
-        vectors, table = open_descriptors(self.files.embeddings, self.session.id, normalize)
-        rows = np.array([self.session.row_of_name[image_name(path)] for path in table["abs_path"]], np.int64)
-        posed = np.isfinite(self.session.world_from_cam(rows)).reshape(-1, 16).all(axis=1)
-        return vectors.choose(np.flatnonzero(posed)), rows[posed]
-
-    @cached_property
-    def _descriptors(self) -> NDArray[np.float32] | Vectors:
-        """Those of `_stored`, in memory unless the map is large."""
-        vectors = self._stored[0]
-        in_memory = np.dtype(np.float32).itemsize * vectors.shape[1] * len(vectors) < MAX_IN_MEMORY
-        return vectors[:] if in_memory else vectors
-
-    @cached_property
-    def _index(self) -> VectorIndex | None:
-        """The index of the descriptors, if the run has one."""
-        settings = self.retrieve_settings.model_copy(update={"faiss_gpu": False})  # this machine may have no GPU
-        return load_index(self.files.embeddings, self.session.id, self._stored[0], settings)
-
-    @cached_property
-    def _verification(self) -> tuple[LocalMethod, Verifier]:
-        """Features and verifier of the run's rerank stage."""
-        settings = read_settings(self.files.reranked_dir / "settings.json", RerankSettings)
-        (method,) = create_local_methods(settings)
-        store = FeatureStore.of_session(self.files.features, self.session.id, method.extractor.settings)
-        return method, Verifier(settings, method.matcher, store)

@@ -434,12 +434,10 @@ def answer_of(scene_map: Map, query: Query, references: Sequence[References], re
 
 def _true_pose(scene_map: Map, query: Query) -> Floats | None:
     """Return world_from_rig (4, 4) of a query of a session by its ground truth; None if that is unknown."""
-    session_id, _, path = query.views[0].name.partition("/")
-    session = scene_map.capture[session_id] if path and session_id in scene_map.capture else None
-    row = None if session is None else session.row_of_name.get(query.views[0].name)
-    if session is None or row is None:
+    found = scene_map.capture.find_image(query.views[0].name)
+    if found is None:
         return None
-    true: Floats = session.world_from_cam([row], ground_truth=True)[0] @ geometry.invert(query.rig_from_cams[0])
+    true: Floats = found[0].world_from_cam([found[1]], ground_truth=True)[0] @ geometry.invert(query.rig_from_cams[0])
     return true if is_posed(true) else None
 
 
