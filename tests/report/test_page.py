@@ -298,7 +298,7 @@ def test_what_escalation_gave_and_took():
     }))  # fmt: skip
     (sentence,) = report._escalation(statuses)
     assert sentence == (
-        "4 queries escalated to further features, because not sure: 2 now ok, 1 with a first pose. "
+        "4 queries localized with the fallback features too, because not sure: 2 now ok, 1 with a first pose. "
         "That took 14 s, 3.50 s per query."
     )
     assert report._escalation(statuses.iloc[:1]) == []

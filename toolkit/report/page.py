@@ -334,7 +334,7 @@ def _verdict(
 
 
 def _escalation(queries: pd.DataFrame) -> list[str]:
-    """Say in a sentence what escalation to further kinds of features gained and cost; empty without escalation."""
+    """Say in a sentence what the fallback features gained and cost; empty without any."""
     escalated = queries[queries["first_status"].notna()]
     if not len(escalated):
         return []
@@ -343,7 +343,7 @@ def _escalation(queries: pd.DataFrame) -> list[str]:
     seconds = (escalated["seconds"] - escalated["first_seconds"]).sum()
     gained = f", {posed} with a first pose" if posed else ""
     return [
-        f"{counted(len(escalated), 'queries')} escalated to further features, because not sure: "
+        f"{counted(len(escalated), 'queries')} localized with the fallback features too, because not sure: "
         f"{(after == Status.OK).sum()} now ok{gained}. That took {number(seconds)} s, "
         f"{number(seconds / len(escalated))} s per query."
     ]
