@@ -11,10 +11,10 @@ from tests.unattended import no_kernels
 from toolkit import pipeline
 from toolkit.capture import Capture
 from toolkit.embedders import open_descriptors
-from toolkit.embedders.references import ReferenceSearch
 from toolkit.files import SceneFiles, image_name, read_references
 from toolkit.geometry import Floats, Ints
 from toolkit.pose.base import Query, View
+from toolkit.scene.map import ReferenceSearch
 from toolkit.threads import fixed_sums
 
 DEVICES = ("ios", "hl", "spot")

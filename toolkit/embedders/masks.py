@@ -113,6 +113,11 @@ def combine(priors: Sequence[Masks]) -> tuple[Masks, list[int]]:
     return Masks(priors[0].count, bits, np.where(limited[which], which, -1)), without
 
 
+def enabled_priors(settings: MaskSettings) -> list[str]:
+    """Return the names of the enabled priors, as settings have them."""
+    return [name for name in ("poses", "gps", "radio") if getattr(settings, name)]
+
+
 class Priors:
     """The priors on the location of queries that the settings enable: rough poses, GPS, radio signals."""
 
@@ -123,11 +128,6 @@ class Priors:
             raise ManifestError(f"retrieve.mask.poses: found no file {settings.poses}. {expected}")
         self.settings = settings
         self.poses = None if settings.poses is None else Trajectory.read(settings.poses)
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the enabled priors, as settings have them."""
-        return [name for name in ("poses", "gps", "radio") if getattr(self.settings, name)]
 
     def masks(self, map_images: Images, query_images: Images, topk: int) -> tuple[Masks | None, dict[str, int]]:
         """Return the map images that each query image may find as one of `topk` references, None: all; and by the name

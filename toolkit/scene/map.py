@@ -18,22 +18,27 @@ from toolkit.capture import Capture, Session
 from toolkit.capture.images import camera_text, thumbnails
 from toolkit.capture.session import RECONSTRUCTION_RECORD
 from toolkit.capture.upright import Turns, upright_turns
-from toolkit.embedders.masks import Masks, near_masks
+from toolkit.embedders import embedding_folders
+from toolkit.embedders.masks import Masks, Priors, enabled_priors, near_masks
 from toolkit.embedders.masks import near as within
-from toolkit.embedders.references import ReferenceSearch
+from toolkit.embedders.references import Describer, Embedded
+from toolkit.embedders.search import embedder_fingerprint, load_index, search
 from toolkit.errors import ArtifactError
-from toolkit.features.features import KINDS
+from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor
 from toolkit.features.matching import (
     AnyMethod,
     DeferredMethod,
     LocalMethod,
+    MutualMatcher,
+    Verifier,
+    create_local_methods,
     create_methods,
     needs_upright,
 )
 from toolkit.features.stores import FeatureStore, OnDemandFeatures, extract_session
 from toolkit.files import RAW_DATA, SceneFiles, map_record_path, read_json, require_current
-from toolkit.geometry import Floats, Ints
-from toolkit.manifest import LocalizeSettings
+from toolkit.geometry import Floats, Ints, unit
+from toolkit.manifest import EmbedSettings, LocalizeSettings, RerankSettings, RetrieveSettings
 from toolkit.mapping.build import build_map
 from toolkit.mapping.local_map import Consistency, LocalMap, map_path
 from toolkit.mapping.pose_consistency import NOMINAL_DEPTH, remarks
@@ -94,6 +99,10 @@ FEW_REFERENCES = 4
 """How many references, those that support an `ok` pose most, fallback features are matched with at first."""
 MAX_KNOWN = 3
 """Largest number of earlier poses of a query that the fallback features judge, too."""
+MAX_IN_MEMORY = 1 << 29
+"""Largest size in bytes of global descriptors (float32) that an open map keeps in memory; larger ones stay on disk."""
+Ranked = tuple[Ints, Floats]
+"""Rows (k,) of map images in their session, best first, and their scores (k,)."""
 
 
 @dataclass
@@ -550,7 +559,7 @@ class Map:
     changed = with_changes
 
     @cached_property
-    def search(self) -> ReferenceSearch:
+    def search(self) -> "ReferenceSearch":
         """The embedders and descriptors of the run.
 
         Raises:
@@ -712,3 +721,132 @@ class Located:
     def what_if(self) -> Callable[..., "Comparison"]:
         """See `scene.query.what_if`; the first three arguments are given."""
         return partial(what_if, *self._opened)
+
+
+class ReferenceSearch:
+    """The embedders of a finished run, its map images, and the features that it reranked with: as in the stages."""
+
+    def __init__(self, files: SceneFiles, capture: Capture, device: str, reranked: bool) -> None:
+        """Load what all queries share; `reranked` tells whether the run localized with reranked references.
+
+        Raise ArtifactError if files are missing, or the map was embedded by another embedder.
+        """
+        self.files, self.capture, self.session, self._told = files, capture, capture[f"{device}_map"], False
+        self.embed_settings = EmbedSettings.read(files.embeddings)
+        self.retrieve_settings = settings = RetrieveSettings.read(files.retrieval_dir)
+        self.images = Embedded.of_map(self.session, files.embeddings, settings.normalize)
+        vectors, folders = self.images.vectors, embedding_folders(files.embeddings).values()
+        named = zip(self.embed_settings.models, folders, strict=True)
+        self.embedders = [Describer.open(name, self.embed_settings, folder).embedder for name, folder in named]
+        for embedder, part in zip(self.embedders, vectors.parts.values(), strict=True):
+            if part.embedder not in ("", embedder_fingerprint(embedder.settings)):
+                fault = f"was made by another embedder or vocabulary than the run's {embedder.name} of now"
+                raise ArtifactError(f"{part.paths[0]} {fault}. Run the embed stage again.")
+        in_memory = np.dtype(np.float32).itemsize * vectors.shape[1] * len(vectors) < MAX_IN_MEMORY
+        self.vectors = vectors[:] if in_memory else vectors
+        self._prior_names = enabled_priors(settings.mask)
+        of_cpu = settings.model_copy(update={"faiss_gpu": False})  # this machine may have no GPU
+        self._index = load_index(files.embeddings, self.session.id, vectors, of_cpu)
+        self._sift = LocalMethod("sift", SiftExtractor(), MutualMatcher.of(KINDS["sift"]))
+        self.verification: tuple[LocalMethod, Verifier] | None = None
+        if reranked:
+            reranking = RerankSettings.read(files.reranked_dir)
+            (method,) = create_local_methods(reranking)
+            store = FeatureStore.of_session(files.features, self.session.id, method.extractor.settings)
+            self.verification = method, Verifier(reranking, method.matcher, store)
+
+    @property
+    def shows_upright(self) -> bool:
+        """Whether the run turned images upright for an embedder, or for the features that it reranked with."""
+        upright = any(Describer(embedder, self.embed_settings).upright for embedder in self.embedders)
+        return upright or (self.verification is not None and KINDS[self.verification[0].name].upright)
+
+    def describe(self, query: Query, kinds: Sequence[LocalMethod]) -> list[NDArray[np.float32]]:
+        """Return for each embedder the global descriptors (C, D) of a query's images; `kinds` are its features."""
+        described = []
+        for describer in (Describer(embedder, self.embed_settings) for embedder in self.embedders):
+            if describer.embedder.inputs == "features":
+                inputs = self._features(query, kinds)
+            else:
+                side, up = describer.embedder.min_side, self.embed_settings.world_up
+                views = [self._turned(view, up) if describer.upright else view for view in query.views]
+                inputs = [describer.prepare(view.read(True, side), view.turns) for view in views]
+            vectors = describer.embedder.embed(inputs)
+            described.append(unit(vectors) if self.embed_settings.normalize else vectors)
+        return described
+
+    def _features(self, query: Query, kinds: Sequence[LocalMethod]) -> list[LocalFeatures]:
+        """Return the SIFT features of the images: those of the localizer, if it has them."""
+        settings = [kind.extractor.settings for kind in kinds]
+        if query.features and self._sift.extractor.settings in settings:
+            at = settings.index(self._sift.extractor.settings)
+            return [features[at] for features in query.features if not isinstance(features, str)]
+        return [view.extract(self._sift) for view in query.views]
+
+    def find(self, query: Query, k: int | None = None, near: Masks | None = None) -> list[Ranked]:
+        """Return the references of each image of a query that `describe` has described, as the run would find them.
+
+        By default, there are `k` as in the run. With `near`, these of `images` may be found, whatever the run's priors
+        say. Raise ArtifactError if the map was embedded by another embedder.
+        """
+        settings, dims = self.retrieve_settings, self.images.vectors.dims
+        for embedder, described, dim in zip(self.embedders, query.descriptors, dims, strict=True):
+            if described.shape[1] != dim:
+                found, expected = f"map descriptors of {dim} dimensions", f"{described.shape[1]} of {embedder.name}"
+                raise ArtifactError.at(self.files.embeddings, found, expected, "Run the embed stage again.")
+        topk = settings.topk if k is None or self.verification else k
+        # As they are read from a file.
+        stored = (one.astype(self.embed_settings.dtype).astype(np.float32) for one in query.descriptors)
+        vectors = np.hstack([unit(one) if settings.normalize else one for one in stored])
+        masks = self._masks(query, topk) if near is None else near
+        if masks is None and self._index is None and len(dims) == 1 and isinstance(self.vectors, np.ndarray):
+            ranked = [self._nearest(vector, self.vectors, topk) for vector in vectors]
+        else:
+            scored = search(vectors, self.vectors, topk, "numpy", index=self._index, allowed=masks, dims=dims)
+            both = ((scores, best[best >= 0]) for scores, best in zip(*scored, strict=True))
+            ranked = [(self.images.rows[best], scores[: len(best)].astype(np.float64)) for scores, best in both]
+        if self.verification:
+            ranked = [self.rerank(of_image, view) for of_image, view in zip(ranked, query.views, strict=True)]
+        return [(rows[:k], scores[:k]) for rows, scores in ranked]
+
+    def _nearest(self, vector: NDArray[np.float32], of_map: NDArray[np.float32], k: int) -> Ranked:
+        """Return what `search` does for one descriptor in memory: the usual case, short enough to read."""
+        scores = np.einsum("nd,d->n", of_map, vector.astype(np.float64)).astype(np.float32)
+        if not np.isfinite(scores).all():
+            raise ValueError("The descriptors of the query or of the map have NaN or infinite values.")
+        best = np.argsort(-scores, kind="stable")[:k]
+        return self.images.rows[best], scores[best].astype(np.float64)
+
+    def rerank(self, ranked: Ranked, view: View) -> Ranked:
+        """Return rows of map images and their numbers of verified matches with an image, most first."""
+        assert self.verification is not None
+        method, verifier = self.verification
+        view = self._turned(view, verifier.settings.world_up) if KINDS[method.name].upright else view
+        names = [self.session.image_names[row] for row in ranked[0]]
+        best = verifier.rank(view.extract(method), view.camera, names, self.session.cameras(ranked[0]))
+        return ranked[0][[at for at, *_ in best]], np.array([verified for _, verified, _ in best], np.float64)
+
+    def _turned(self, view: View, world_up: Sequence[float] | None) -> View:
+        """Return an image of a session with the turns that a stage found for it; other images as they are."""
+        if (found := self.capture.find_image(view.name)) is None:
+            return view
+        turns = upright_turns(self.capture, world_up).of(found[0], [found[1]])
+        return replace(view, turns=int(turns[0]))
+
+    def _masks(self, query: Query, topk: int) -> Masks | None:
+        """Return the map images that the run's priors let each image find, None: all, as for images of no session."""
+        if not self._prior_names:
+            return None
+        found = [place for view in query.views if (place := self.capture.find_image(view.name)) is not None]
+        if len(found) < len(query.views):
+            if not self._told:
+                message = "%s: images from outside a session are searched without %s"
+                log.warning(message, self.session.id, " and ".join(self._prior_names))
+            self._told = True
+            return None
+        images = found[0][0], np.array([row for _, row in found], np.int64)
+        return self._priors.masks((self.session, self.images.rows), images, topk)[0]
+
+    @cached_property
+    def _priors(self) -> Priors:
+        return Priors(self.retrieve_settings.mask)
