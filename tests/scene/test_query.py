@@ -176,6 +176,7 @@ def test_a_map_and_results_are_shown_in_3d(
     assert any(label.startswith("rival, 90% of the support") for label in labels)
     assert view.save(tmp_path / "view.rrd").stat().st_size > 100_000
     assert picture_of(scene_map.show_3d()).width > 800
+    assert scene_map.show_3d().save(tmp_path / "map.rrd").stat().st_size > 10_000, "a map without queries"
 
 
 def test_the_eye_sees_the_chosen_camera_in_the_middle(scene_map: Map) -> None:

@@ -52,6 +52,7 @@ from toolkit.figures.top_view import Eye, draw_scene_3d, pyramids
 from toolkit.files import relative_url, write_atomic
 from toolkit.geometry import Floats, local_origin, project, rotation_to_quaternion, shifted
 from toolkit.mapping.local_map import LocalMap
+from toolkit.pose.base import QueryResult, split_status
 from toolkit.results.localized import REFERENCES, Localizations, QueryDetails, ShownImage, support_of, sure_points
 from toolkit.results.metrics import is_posed, named_as_meters
 from toolkit.runs.kernel import TEXT_BARS
@@ -295,8 +296,9 @@ class View3D:
         cameras = [answer.details.cameras[0] for answer in self.answers]
         errors = [answer.error or (np.nan, np.nan) for answer in self.answers]
         turned, moved = np.reshape(errors, (-1, 2)).T
-        table = pd.DataFrame([answer.result.to_row(0, "") for answer in self.answers])
-        table = table.assign(status_text=table["status"], rotation_error_deg=turned, translation_error_m=moved)
+        columns = QueryResult.failed("").to_row(0, "")  # a map by itself has no answers
+        rows = pd.DataFrame([answer.result.to_row(0, "") for answer in self.answers], columns=[*columns])
+        table = split_status(rows).assign(rotation_error_deg=turned, translation_error_m=moved)
         estimated = np.array([camera.world_from_cam for camera in cameras]).reshape(-1, 4, 4)
         true = np.array([camera.world_from_cam_true for camera in cameras]).reshape(-1, 4, 4)
         names = [shown_name(answer.name) for answer in self.answers]
