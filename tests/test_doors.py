@@ -264,6 +264,8 @@ def test_an_open_map_finds_for_a_query_what_the_stages_found(
     has_priors = "mask" in change.get("retrieve", {})
     capture = with_priors(small_capture, tmp_path) if has_priors else small_capture
     files, references = found_by_stages(capture, small_embedded, tmp_path / "run", change)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")  # the file of rough poses was named relative to the run's folder
     scene_map, session = Map.open(files.run, files.scene, "spot"), Capture.open(capture)["hl_query"]
     lines = {image_name(line["path"]): line["topk"] for line in read_references(references, "path")}
     results, limited = PairResults.open(files.poses_txt("spot", "hl")), False
@@ -285,6 +287,7 @@ def test_an_open_map_finds_for_a_query_what_the_stages_found(
         return
     assert limited, "images from outside a session have no priors"
     assert sum("from outside a session" in one.getMessage() for one in caplog.records) == 1, "said once"
+    monkeypatch.chdir(tmp_path)
     other = change | {"retrieve": change["retrieve"] | {"topk": 2}}
     if "rerank" not in change:  # a run with fewer references, and an open map that is asked for fewer
         _, references = found_by_stages(capture, small_embedded, tmp_path / "other", other)

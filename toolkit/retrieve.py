@@ -85,6 +85,9 @@ def retrieve_pairs(
     folder = out.parent if out.suffix == ".jsonl" else out
     table = PairRows(capture.name, folder)
     priors = Priors(settings.mask)
+    if settings.mask.poses is not None:  # an open map reads the file again, from another folder perhaps
+        mask = settings.mask.model_copy(update={"poses": str(Path(settings.mask.poses).resolve())})
+        settings = settings.model_copy(update={"mask": mask})
 
     @cache
     def load_queries(device: str) -> Embedded:

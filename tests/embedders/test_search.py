@@ -247,3 +247,10 @@ def test_a_single_image_finds_what_the_search_of_many_finds(tmp_path: Path, dims
                         np.testing.assert_array_equal(one, other)
     with pytest.raises(ValueError, match="NaN"):
         search(np.full((1, sum(dims)), np.nan, np.float32), stored, 1, "numpy", dims=dims)
+    allowed, broken = np.arange(count) < 5, stored[:].copy()
+    broken[5:] = np.nan  # rows that a mask excludes are not read
+    masks = Masks.of([allowed[None]], np.zeros(1, np.int64), count)
+    np.testing.assert_array_equal(
+        search(asked[:1], broken, 3, "numpy", allowed=masks, dims=dims)[1],
+        search(asked[:1], stored, 3, allowed=allowed, dims=dims)[1],
+    )

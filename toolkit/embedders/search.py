@@ -492,7 +492,7 @@ def search(
         raise ValueError(f"{len(masks)} masks of {masks.count} rows for {len(query)} queries and {len(vectors)} rows.")
     if isinstance(allowed, np.ndarray) and allowed.shape != (len(vectors),):
         raise ValueError(f"allowed has shape {allowed.shape}; expected ({len(vectors)},), one value per database row.")
-    if masks is not None and index is not None and k:
+    if masks is not None and k and (index is not None or backend == "numpy"):  # reads no row that a mask excludes
         for numbers, mask in masks.distinct():
             found = search(_choose(query, numbers), vectors, k, backend, compute_device, faiss_gpu, index, mask, dims)
             scores[numbers], indices[numbers] = found
@@ -659,7 +659,7 @@ def _backend(
     if backend not in get_args(Backend):
         raise ValueError(f"Unknown backend {backend!r}; expected {', '.join(get_args(Backend))}.")
     if backend == "numpy":
-        return partial(_best_by_numpy, query, masks, dims)
+        return partial(_best_by_numpy, query, dims)
     if backend == "torch" or len(dims) > 1 or masks is not None:
         return _torch_backend(query, masks, compute_device, dims)
     if not faiss_gpu:
@@ -670,12 +670,8 @@ def _backend(
     return lambda block, _, number: faiss.knn_gpu(gpu, query, block, number, metric=faiss.METRIC_INNER_PRODUCT)
 
 
-def _best_by_numpy(
-    query: _Floats, masks: Masks | None, dims: Sequence[int], block: _Floats, start: int, number: int
-) -> Found:
+def _best_by_numpy(query: _Floats, dims: Sequence[int], block: _Floats, start: int, number: int) -> Found:
     scores = fused_products(query, block, dims, lambda a, b: a @ b.T)
-    if masks is not None:
-        scores = np.where(masks.rows(start, start + len(block)), scores, -np.inf)
     rows = np.argsort(-scores, axis=1, kind="stable")[:, :number]
     return np.take_along_axis(scores, rows, 1), rows
 
