@@ -155,7 +155,9 @@ def test_a_session_that_broke_after_a_run_costs_only_its_own_pairs(small_capture
     assert [name.partition(":")[0] for name in worst.names] == ["ios in the map of ios"] * 2
 
 
-def test_a_run_whose_pairs_all_fail_to_open_says_why(small_capture: Path, tmp_path: Path) -> None:
+def test_a_run_whose_pairs_all_fail_to_open_says_why(
+    small_capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """It said "found 0, expected a number from 0 to -1"."""
     import h5py
 
@@ -169,9 +171,11 @@ def test_a_run_whose_pairs_all_fail_to_open_says_why(small_capture: Path, tmp_pa
         with pytest.raises(ArtifactError, match=r"_query_hl\.h5: another version.*Run its stage again"):
             Run.open(tmp_path).result(query)
     assert WorstQueries(poses).names == []
+    choose(WorstQueries(poses), "worst")
+    assert "Run its stage again" in capsys.readouterr().out
     for path in poses.glob("*.h5"):
         path.unlink()
-    with pytest.raises(ArtifactError, match="There are none"):
+    with pytest.raises(ArtifactError, match="no localized query"):
         Run.open(tmp_path).result()
 
 

@@ -241,13 +241,16 @@ class WorstQueries:
         """Take the queries of all pairs, or those of a device, in a folder of poses that have stored correspondences
         and can be read. The folders are as for `InspectedPair`.
         """
-        pairs, self._errors = list[InspectedPair](), list[ToolkitError]()
+        pairs, errors = list[InspectedPair](), list[ToolkitError]()
         for mapped, queried in pairs_of(poses_dir, ".h5"):
             if map_device in ("all", mapped) and query_device in ("all", queried):
                 try:
                     pairs.append(InspectedPair(mapped, queried, poses_dir, None, map_dir, sessions_root))
                 except OF_THE_DATA as error:  # an unfinished pair has no table, or a session broke after a good run
-                    self._errors.append(error)
+                    errors.append(error)
+        none = ArtifactError.at(poses_dir, "no localized query", do="Run the stage localize first.")
+        self.why_none = next(iter(errors), none)
+        """The error if there are no queries: the first of a pair, if there are pairs."""
         queries = [(pair, number) for pair in pairs for number in range(len(pair))]
         tables = [pair.localized.localizations.errors for pair in pairs]
         self._queries = [queries[k] for k in worst_first(pd.concat(tables, ignore_index=True))] if queries else []
@@ -272,8 +275,8 @@ class WorstQueries:
         was localized in several maps is returned where it is worst. Raise ArtifactError if there is none, or the error
         of the first pair if none can be read.
         """
-        if self._errors and not self._queries:
-            raise self._errors[0]
+        if not self._queries:
+            raise self.why_none
         if rank == WORST:
             rows = (pair.localized.results.table.iloc[number] for pair, number in self._queries)
             rank = next((at for at, row in enumerate(rows) if row.get("num_matches", 1) > 0), 0)
@@ -316,7 +319,7 @@ def choose(queries: Any, chosen: int | str = 0) -> Choice:
     from IPython.display import display
 
     if not len(queries.names) and (isinstance(chosen, int) or chosen == WORST):
-        print("There are no queries to show.")
+        print(getattr(queries, "why_none", "There are no queries to show."))
         return Choice(None)
     try:
         choice = Choice(queries.look(chosen))
