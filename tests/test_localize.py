@@ -1582,8 +1582,8 @@ def test_threads_that_localize_again_have_nothing_to_load(
     opened: list[Map] = []
     open_map = Map.open
     monkeypatch.setattr(Map, "open", lambda *run: opened.append(open_map(*run)) or opened[-1])
-    loaders = [(maps, "PnpLocalizer"), (maps, "upright_turns"), (search, "upright_turns")]
-    loaders += [(search, name) for name in ("create_embedder", "open_descriptors", "load_index")]
+    loaders = [(maps, name) for name in ("PnpLocalizer", "upright_turns", "load_index")]
+    loaders += [(search, name) for name in ("create_embedder", "open_descriptors")]
 
     def in_threads(localize: Callable[[int], QueryResult], numbers: range, _: int) -> list[QueryResult]:
         for module, name in loaders:
