@@ -179,6 +179,15 @@ def test_a_map_and_results_are_shown_in_3d(
     assert scene_map.show_3d().save(tmp_path / "map.rrd").stat().st_size > 10_000, "a map without queries"
 
 
+def test_rivals_outside_the_map_are_counted(result: QueryResult) -> None:
+    """Five, each with its support, made a title wider than the figure."""
+    far = result.world_from_rig.copy()
+    far[:2, 3] += 500.0
+    figure = replace(result, rivals=(Rival(far, 0.4),) * 5).show().figure
+    titles = [axis.get_title() for part in figure.subfigs for axis in part.axes]
+    assert "from above\noutside the picture: 5 rivals" in titles
+
+
 def test_the_eye_sees_the_chosen_camera_in_the_middle(scene_map: Map) -> None:
     from toolkit.figures.top_view import Eye
 

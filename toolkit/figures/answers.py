@@ -1,6 +1,7 @@
 """One localized query: its status in words, numbers, correspondences, pose and rivals, and a figure of them."""
 
 import textwrap
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -59,7 +60,7 @@ SURE = 2.4477
 MAX_POINTS = 20_000  # drawn; more only take time
 NAMES, COLORS = ("as it was", "again"), (ESTIMATED, PURPLE)
 """Of the answers in a figure; a single answer is called `estimated`."""
-BELOW: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16), "ncols": 2, "fontsize": 7.5}
+BELOW: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.2), "ncols": 2, "fontsize": 7.5}
 """Legend below a panel."""
 
 
@@ -393,7 +394,7 @@ def _draw_from_above(axis: "Axes", answers: Sequence[Answer]) -> None:
     for rival in answers[-1].result.rivals:
         pose, label = rival.world_from_rig @ answer.details.rig_from_cam, f"rival, {rival.support:.0%} of the support"
         diamond = Layer(pose[None], label, BLUE, 0.08, hollow=True, s=40, marker="D")
-        named.append((pose, f"rival ({rival.support:.0%})", diamond))
+        named.append((pose, "rival", diamond))
     named += [(pose, name, _dot(pose, name, color, 0.12)) for pose, name, color in shown]
     layers = [
         Layer(points, None, "0.75", s=1, lw=0, rasterized=True),
@@ -414,8 +415,9 @@ def _draw_from_above(axis: "Axes", answers: Sequence[Answer]) -> None:
     axis.scatter([], [], s=9, c="0.75", lw=0, label="map points")  # a larger dot for the legend
     draw_layers(axis, ground, layers, window)
     outside = ((centers < window[0]) | (centers > window[1])).any(axis=1)
-    names = ", ".join(name for (_, name, _), far in zip(named, outside, strict=True) if far)
-    axis.set_title("from above" + (f"\noutside the picture: {names}" if names else ""), fontsize=9)
+    names = Counter(name for (_, name, _), far in zip(named, outside, strict=True) if far)
+    far = ", ".join(f"{count} rivals" if count > 1 else name for name, count in names.items())
+    axis.set_title("from above" + (f"\noutside the picture: {far}" if far else ""), fontsize=9)
     axis.legend(**BELOW)
 
 

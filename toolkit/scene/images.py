@@ -13,6 +13,7 @@ from tqdm.auto import tqdm
 from toolkit.capture.images import sees_all
 from toolkit.errors import ArtifactError, CameraError, ImageError, reason_of
 from toolkit.pose.base import CAMERA, Query, QueryResult, RoughPose, Status
+from toolkit.runs.folder import counted
 from toolkit.scene.map import Map
 from toolkit.scene.query import Image, camera_key, guessed_camera, with_focal
 
@@ -94,7 +95,7 @@ def localize_images(
             result = unknown.locate(focal_px)
             # Unlike in `Map.retry`, rivals may come from a wrong focal length, so an `ok` result keeps its status.
             if result.status.rank >= results[number].status.rank and not result.camera_contradicted:
-                text = f"focal length {focal_px:.0f} px, from {len(sure)} other photographs of its camera"
+                text = f"focal length {focal_px:.0f} px, from {counted(len(sure), 'other images of its camera')}"
                 results[number] = replace(result, remark="; ".join(filter(None, [text, result.remark])))
     return results
 
