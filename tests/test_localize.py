@@ -33,7 +33,7 @@ from toolkit.capture.session import IMPORT_RECORD
 from toolkit.capture.tables import POSE_NAMES
 from toolkit.embed import embed_sessions
 from toolkit.embedders import EMBEDDERS
-from toolkit.embedders import references as search
+from toolkit.embedders import embedded as search
 from toolkit.errors import ArtifactError, CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.evaluate import evaluate_scene
 from toolkit.features.features import KINDS, LocalFeatures, MutualMatcher, SiftExtractor, SiftSettings, unit_descriptors

@@ -19,7 +19,7 @@ from toolkit.capture import Capture, Session
 from toolkit.capture.images import default_workers, prefetch, read_image
 from toolkit.capture.upright import upright_turns
 from toolkit.embedders import WEIGHTS, resolve_model
-from toolkit.embedders.references import Describer
+from toolkit.embedders.embedded import Describer
 from toolkit.errors import CaptureError, ImageError, ManifestError, ToolkitError
 from toolkit.features.features import LocalFeatures, SiftExtractor
 from toolkit.features.stores import FeatureStore, extract_session

@@ -531,8 +531,9 @@ def _write_poses(
     table = pd.DataFrame(rows).rename(columns=POSES_UNIT).reindex(columns=columns)
     write_csv(path.with_suffix(".csv"), in_unit_of_poses(table, settings.unit))
     posed = [number for number, result in enumerate(results) if result.world_from_rig is not None]
+    arrays = [results[number].arrays() for number in posed]
     poses, covariances = (
-        np.array([results[number].arrays()[name] for number in posed]).reshape(-1, size, size)
+        np.array([of_result[name] for of_result in arrays]).reshape(-1, size, size)
         for name, size in (("world_from_rig", 4), ("covariance", 6))
     )
     times, devices = ([keys[number][part] for number in posed] for part in (0, 1))

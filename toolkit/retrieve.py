@@ -16,8 +16,8 @@ from tqdm.auto import tqdm
 
 from toolkit.capture import Capture, Session
 from toolkit.embedders import Vectors, embedding_folders, load_embeddings
+from toolkit.embedders.embedded import Embedded
 from toolkit.embedders.masks import Masks, Priors
-from toolkit.embedders.references import Embedded
 from toolkit.embedders.search import (
     EXACT,
     Backend,
@@ -117,7 +117,7 @@ def retrieve_pairs(
                 for prior, count in without.items():
                     if count:
                         message = "map %s, query %s: %s leaves the whole map to %d of %d query images"
-                        log.warning(message, images[0][0].id, query.session.id, prior, count, len(query.rows))
+                        log.warning(message, database.session.id, query.session.id, prior, count, len(query.rows))
                 skipped = skip_existing and is_current(path, record)
                 # Single images that are localized later search the map's index, too.
                 skipped = skipped and is_index_current(embeddings, database.session.id, database.vectors, settings)

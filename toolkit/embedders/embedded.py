@@ -1,6 +1,5 @@
-"""Describe images, find their references in a map, rerank these: the stages for many images, an open map for one."""
+"""Embedded images of a session, and embedders as a run uses them: for the stages and an open map."""
 
-import logging
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
@@ -18,8 +17,6 @@ from toolkit.errors import ArtifactError, CaptureError
 from toolkit.files import image_name
 from toolkit.geometry import Ints, unit
 from toolkit.manifest import EmbedSettings
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from toolkit.capture import Capture, Session
-from toolkit.embedders.references import Embedded
+from toolkit.embedders.embedded import Embedded
 from toolkit.errors import ArtifactError
 from toolkit.figures.query_images import draw_image, query_and_references, shown_name
 from toolkit.figures.style import (

@@ -19,9 +19,9 @@ from toolkit.capture.images import camera_text, thumbnails
 from toolkit.capture.session import RECONSTRUCTION_RECORD
 from toolkit.capture.upright import Turns, upright_turns
 from toolkit.embedders import embedding_folders
+from toolkit.embedders.embedded import Describer, Embedded
 from toolkit.embedders.masks import Masks, Priors, enabled_priors, near_masks
 from toolkit.embedders.masks import near as within
-from toolkit.embedders.references import Describer, Embedded
 from toolkit.embedders.search import embedder_fingerprint, load_index, search
 from toolkit.errors import ArtifactError
 from toolkit.features.features import KINDS, LocalFeatures, SiftExtractor
